@@ -7,7 +7,7 @@ A device file selects the format with the key `format` of its section `[frames]`
 - `described`: frames of fixed length whose layout the device file describes (module `frame_layout`),
 - `auto`: `binary` or `text`, depending on the bytes (module `formats`).
 
-Each format has two classes. The section class declares the further keys of the section `[frames]`, and creates the
+Each format has two classes. The section class declares the other keys of the section `[frames]`, and creates the
 parser. The parser class is derived from `frame.Parser`. A parser receives bytes and does not open a port.
 
 May import: record, port, model, flags.

@@ -9,7 +9,8 @@ arrival times, and computes a smooth host time for each reading. The bandwidth o
 averages over many arrivals. In the first seconds, the bandwidth is larger, so that the fit converges quickly.
 
 The wall clock of the host may be set while a stream runs. The time between two readings is therefore never computed
-from the wall clock. If the device sends no clock, it is computed from the monotonic time of the chunks.
+from the wall clock. If the device sends no clock, the time between two readings is computed from the monotonic arrival
+times of the chunks.
 """
 
 import math
@@ -26,7 +27,7 @@ FIRST_BANDWIDTH_Hz = 1.0
 """Bandwidth when a fit begins, Hz. The bandwidth then decreases in inverse proportion to the age of the fit."""
 
 MAX_LOOP_GAIN = 0.5
-"""Largest gain of the loop in one correction, dimensionless. It keeps the loop stable if readings are rare."""
+"""Largest gain of the loop in one correction, dimensionless. This limit keeps the loop stable if readings are rare."""
 
 MAX_DELAY_s = 1.0
 """Largest time by which an arrival may be later than predicted, s.
@@ -37,7 +38,7 @@ After a longer delay, the fit starts again, because the device was reset, or one
 MAX_LEAD_s = 0.3
 """Largest time by which an arrival may be earlier than predicted, s.
 
-A reading cannot arrive before it was taken, so the limit is smaller than that of a delay.
+A reading cannot arrive before it was taken, so this limit is smaller than the limit of a delay.
 """
 
 
@@ -49,7 +50,7 @@ def elapsed_s(previous: Chunk, chunk: Chunk) -> float:
     exceptions:
 
     - All chunks of a file have the same `timestamp`. The result is then 0.
-    - All chunks have the same `clock_ns` if their source does not state a monotonic time. The wall clock is then used.
+    - If a source does not state a monotonic time, all its chunks have the same `clock_ns`. The wall clock is then used.
 
     Args:
         previous: The earlier chunk.
@@ -101,7 +102,7 @@ class DeviceClock:
         self._latest_host_s = -math.inf  # host time of the latest reading, which does not decrease
 
     def stamp(self, chunk: Chunk, frames: Sequence[Frame], modulus: int) -> None:
-        """Write into the frames of a chunk the times at which they were taken, and adjust the clock to the chunk.
+        """Write the times at which the frames of a chunk were taken into the frames, and adjust the clock to the chunk.
 
         Args:
             chunk: The bytes that contain the ends of the frames.
@@ -124,7 +125,8 @@ class DeviceClock:
             if frame.t_us is not None:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
 
-        # The bytes of a chunk of the largest size may have waited to be read. Its time is then not that of an arrival.
+        # The bytes of a chunk of the largest size may have waited to be read. The time of such a chunk is not an
+        # arrival time.
         is_read_at_once = len(chunk.data) < MAX_READ_BYTES
         if is_read_at_once:
             self._latest_arrival_s = chunk.timestamp
@@ -132,12 +134,12 @@ class DeviceClock:
                 self._fit_arrival(chunk.timestamp)
 
     def _divide_interval(self, interval_s: float, arrival_s: float, frames: Sequence[Frame]) -> None:
-        """Write times into frames without a clock. If later frames of the chunk have a clock, it replaces their times.
+        """Write times into the frames of a chunk. The times of frames with a clock are replaced afterwards.
 
         The time since the previous chunk is divided evenly among the frames of the chunk, and the last frame has the
         arrival time of the chunk. The time since the previous chunk is unknown for the first chunk of a connection and
-        for all chunks of a file, which arrive at the same time. All frames of such a chunk have the same `host_s`. In
-        `dt_s` and `clock_s`, the interval between them is assumed to be `FILE_INTERVAL_s`.
+        for all chunks of a file, which arrive at the same time. All frames of such a chunk have the same `host_s`. For
+        `dt_s` and `clock_s`, the interval between two frames of such a chunk is assumed to be `FILE_INTERVAL_s`.
 
         Args:
             interval_s: Time since the previous chunk, s; 0 if it is unknown.
@@ -159,10 +161,11 @@ class DeviceClock:
         """Compute the time of a frame from the clock of the device, and write it into the frame.
 
         A straight line converts the clock to the time of the host (`_predicted_s`). The line was fitted to the arrivals
-        of earlier readings. A new fit begins if there is none, if the device has restarted, or if the predicted time is
-        far after the arrival.
+        of earlier readings. A new fit begins if there is no fit yet, if the device has restarted, or if the predicted
+        time is far after the arrival.
 
-        The clock may be lower than at the previous reading for three reasons, which the difference distinguishes:
+        The clock may be lower than at the previous reading for three reasons. The size of the decrease shows the
+        reason:
 
         - At most `MAX_DELAY_s`: the reading arrived late, for example because another datagram has overtaken it.
         - At least half of the range of the clock: the clock has wrapped to 0. If the range is so small that a late
@@ -212,9 +215,9 @@ class DeviceClock:
         """Return whether the predicted time of a reading is much later than its arrival, so that the fit is wrong.
 
         A reading is taken before it arrives. The fit is wrong if the clock of the host or of the device was set. The
-        fit is also wrong after the program has paused: it was adjusted to late arrivals of the readings that waited
-        for the program, and further readings were lost. A provisional fit is never considered wrong, because its times
-        may be wrong by the length of a chunk.
+        fit is also wrong after the program has paused. During the pause, some readings waited for the program, so that
+        the fit was adjusted to their late arrivals, and further readings were lost. A provisional fit is never
+        considered wrong, because its times may be wrong by the length of a chunk.
 
         Args:
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
@@ -239,16 +242,17 @@ class DeviceClock:
         self._is_fit_provisional = True
 
     def _fit_arrival(self, arrival_s: float) -> None:
-        """Fit the clock of the device to the arrival time of a chunk, whose readings have been processed.
+        """Fit the clock of the device to the arrival time of a chunk after its readings have been processed.
 
         The fit is a straight line: the host time is `_fitted_host_s` when the clock of the device is `_fitted_us`, and
         then advances by `rate` seconds per second of the device. The time that the line predicts for the latest reading
         is `_predicted_s`.
 
-        The fit is corrected with one step of a second-order delay-locked loop (Adriaensen 2005). The gain of the loop
-        is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`, because the loop would become unstable with a
-        larger gain. The correction adds sqrt(2) w delay_s to the predicted host time, and w^2 delay_s / step_s to the
-        rate of the clock. The bandwidth decreases with the age of the fit.
+        The fit is corrected with one step of a second-order delay-locked loop (Adriaensen 2005). Two numbers determine
+        the correction: the time step_s since the previous correction, and the difference delay_s between the arrival
+        time and the predicted time. The gain of the loop is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`,
+        because a larger gain would make the loop unstable. The correction adds sqrt(2) w delay_s to the predicted host
+        time, and w^2 delay_s / step_s to the rate of the clock. The bandwidth decreases with the age of the fit.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.

@@ -37,7 +37,8 @@ CRC = struct.Struct("<H")
 MAX_STUFFED_LENGTH = len(cobs.encode(b"\x01" * (HEADER.size + 255 * 4 + CRC.size)))
 """Length of the longest frame after byte stuffing, without its delimiter, bytes.
 
-The frame contains 255 charges, because one byte contains their number. Bytes without a zero become the longest.
+The frame contains 255 charges, because one byte states the number of charges. Byte stuffing adds the most bytes to a
+frame without a zero byte.
 """
 
 
@@ -45,7 +46,7 @@ def encode_frame(frame: Frame) -> bytes:
     """Encode a binary frame with COBS, and append the delimiter. A missing counter or clock is encoded as zero.
 
     Raises:
-        struct.error, OverflowError: If a number does not fit its field.
+        struct.error, OverflowError: If a number does not fit into its field.
     """
     charge_count = len(frame.values)
     header = HEADER.pack(FRAME_VERSION, frame.seq or 0, frame.t_us or 0, charge_count, frame.bits)
@@ -108,8 +109,8 @@ class AutoParser(Parser):
         """Return the frames whose last byte is in `data`.
 
         Until the format is recognised, the data are passed to the parsers of all formats. The first parser that finds a
-        frame receives all further data. The description of the format and the moduli of the counter and the clock are
-        copied from the parser together with each frame, because the parser may determine them only after many frames.
+        frame receives all further data. With each frame, the description of the format and the moduli of the counter
+        and the clock are copied from this parser, because it may determine them only after many frames.
         """
         for parser in self._parsers:
             frames = parser.feed(data)
@@ -129,7 +130,7 @@ class AutoParser(Parser):
     def reset(self) -> None:
         """Drop the bytes of an unfinished frame, because the next bytes come from another connection.
 
-        A format that was recognised stays recognised.
+        A recognised format is kept.
         """
         super().reset()
         for parser in self._parsers:

@@ -19,14 +19,14 @@ from isocharge.serve.model.contact import Contact, Validity
 from isocharge.serve.record.record import FollowedFilm, OtherContact, TrackedContact
 
 SMALLEST_RESTART = 128
-"""Smallest increase of a frame counter across the end of its range that counts as a restart of the board, not as a gap.
+"""Smallest increase of a frame counter beyond the end of its range that is taken for a restart instead of a gap.
 
-The value is half of the range of a counter of one byte. With a larger counter, a gap of so many frames rarely coincides
-with the end of the range. A restart in the upper half of the range is more frequent.
+The value is half of the range of a counter of one byte. If the counter has more bytes, a gap of so many frames rarely
+coincides with the end of the range. A restart while the counter is in the upper half of its range is more frequent.
 """
 
 MAX_LATE_FRAMES = 8
-"""Largest decrease of a frame counter that counts as a late frame, for example of datagrams in another order."""
+"""Largest decrease of the frame counter at a late frame, for example if datagrams arrive in another order."""
 
 SEQ_MODULUS = 1 << 16
 """Value at which a 16-bit frame counter wraps to 0."""
@@ -44,7 +44,7 @@ FLAGS = "flags"
 """Name of the field with the flags of a frame."""
 
 TIMES_US = {"t_us": 1.0, "t_ms": 1e3, "t_s": 1e6}
-"""Unit of the clock of a device, us, by the name of the field that contains the clock."""
+"""For each name of a clock field: duration of one count of the clock, us."""
 
 OTHER_CHARGE_UNITS = ("fC", "nC", "µC", "μC", "uC", "C", "coulomb", "V", "mV", "uV", "µV", "μV", "volt", "volts")
 """Units other than pC that the names of channels and lines of text may state."""
@@ -57,7 +57,8 @@ Raw = TypeVar("Raw")
 class Frame:
     """One reading of a sensor, on its way from the bytes to its record.
 
-    A parser creates the frame. The clock of the stream, and after it each stage, sets some of the other attributes.
+    A parser creates the frame. The clock of the stream sets some of the other attributes, and each later stage sets
+    further attributes.
 
     Attributes:
         seq: Frame counter, modulo the `seq_modulus` of the parser; None if the format has no counter.
@@ -66,35 +67,36 @@ class Frame:
         bits: Flags that the device sends; see `SATURATED_BIT`.
         names: Names of the channels; empty if the format has no names.
         words: Words in the line of text, in their order; empty for other formats.
-        host_s: Time of the host, unix seconds. It is computed from the clock of the device. If the device sends no
-            clock, it is computed from the arrival time. The time decreases only if a clock was set.
+        host_s: Time of the host, unix seconds. The time is computed from the clock of the device, or from the arrival
+            time if the device sends no clock. The time decreases only if a clock was set.
         device_us: Clock of the device after the wraps were removed, us; None if the device sends no clock.
         is_clock_reset: Whether the clock of the device jumped back by more than a second before this frame.
-        dt_s: Time since the previous valid frame, s; 0 for the first frame of a device with a clock. It does not depend
-            on the wall clock of the host.
-        intervals: Number of sampling intervals since the previous valid frame: 1 without a gap, more if frames are
-            missing or invalid, and 0 for a copy of the previous frame, and for a late frame, which has counted as
-            missing. If the frames have no counter, no frame counts as missing.
-        clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, it is a time of the host
-            that does not jump if the wall clock is set.
+        dt_s: Time since the previous valid frame, s; 0 for the first frame of a device with a clock. This time does not
+            depend on the wall clock of the host.
+        intervals: Number of sampling intervals since the previous valid frame: 1 without a gap, and more if frames are
+            missing or invalid. The number is 0 for a copy of the previous frame, and also for a late frame, because the
+            late frame was already counted as missing. If the frames have no counter, no frame counts as missing.
+        clock_s: Time of the frame on the clock of the device, s. If the device sends no clock, this is a time of the
+            host that does not jump when the wall clock is set.
         sent: Values of the electrodes in their order, shape (n_electrode,), in the unit of the device.
         is_valid: Whether all values of the electrodes can be charges.
         raw_pC: Charges as the device sent them, shape (n_electrode,), pC.
-        charge_pC: Charges after the stages so far, and touch charges after all stages, shape (n_electrode,), pC; None
-            while there is no tare, and for an invalid frame.
+        charge_pC: Charges after the stages that the frame has passed, shape (n_electrode,), pC. After all stages, they
+            are the touch charges. None while there is no tare, and for an invalid frame.
         tare_pC: Charge at rest that was subtracted, shape (n_electrode,), pC; None without touch charges.
-        noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC. It requires a tare.
+        noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC. It is set only if there is a
+            tare.
         is_contact: Whether something touches the film.
         warming_pC: Part of the charges that is due to a warming of the film since the previous frame, shape
-            (n_electrode,) or one number for all electrodes, pC. It was subtracted from `charge_pC`.
+            (n_electrode,) or one number for all electrodes, pC. This part was subtracted from `charge_pC`.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
-        is_base_held: Whether the tare follows the charge at rest and the warming. The base of the touch detection then
-            does not decay while it is the remaining charge of a touch.
+        is_base_held: Whether the tare follows the charge at rest and the warming. If so, the base of the touch
+            detection does not decay as long as the base is the charge that remains of the latest touch.
         contact: The computed contact; None if nothing touches the film, or if the frame is invalid.
-        contact_flags: Flags that are the reasons why the contact may be wrong.
+        contact_flags: Flags that state why the contact may be wrong.
         film: Estimated film; None if the film is not followed.
         tracked: The tracked contact; None if nothing touches the film, or if contacts are not tracked.
-        event: Event of the tracked contact that begins with the frame, or None.
+        event: Event that begins with the frame, such as `press` or `release`; None if no event begins.
         other: Another contact with the same charges, or None.
         flags: Flags of `isocharge.serve.flags` that do not depend on the contact.
     """
@@ -270,7 +272,8 @@ class Parser(ABC):
         seq_modulus: Value at which the `seq` of a frame wraps to 0.
         t_us_modulus: Time at which the `t_us` of a frame wraps to 0, us.
         counts: Counters since the parser was created.
-        recognised: Parser that has recognised the format, and can take the place of this parser; None if there is none.
+        recognised: Parser that has recognised the format, and can take the place of this parser; None without such a
+            parser.
         unread_line: Latest line of text that does not have the layout of the frames; empty without such a line.
     """
 
@@ -296,18 +299,19 @@ class Parser(ABC):
     def reset(self) -> None:
         """Drop the bytes of an unfinished frame, because the next bytes come from another connection.
 
-        No frame is counted as lost before the first frame of the next connection.
+        Frames that are lost between the two connections are not counted.
         """
         self.counts.bytes_dropped += len(self._tail)
         self._tail = b""
         self._previous_seq = None
 
     def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
-        """Compare the counter of a frame with that of the previous frame, and return the flags of the frame.
+        """Compare the counter of a frame with the counter of the previous frame, and return the flags of the frame.
 
-        The increase of the counter since the previous frame decides: 1 is the next frame, 0 is a repeated frame, a
-        small increase means that frames were lost, and a small decrease is a late frame. After any other change, the
-        device has restarted. Lost frames, repeated frames and restarts are added to `counts`.
+        The flags depend on the increase of the counter since the previous frame. After an increase of 1, the frame is
+        the next frame. After an increase of 0, it is a repeated frame. Any other small increase means that frames were
+        lost. A small decrease means that the frame is late. Any other change means that the device has restarted. Lost
+        frames, repeated frames and restarts are added to `counts`.
 
         Args:
             seq: Counter of the frame; None if the format has no counter.
@@ -333,8 +337,8 @@ class Parser(ABC):
             return (REPEAT,)
         # An increase below `gap_limit` means that frames were lost. If the counter is lower than before, it may have
         # wrapped. A large increase across the end of its range is more probably a restart, so the limit is then lower.
-        # The counter has not wrapped, so that no increase counts as a gap, if the clock was reset at the same time, or
-        # if the counter had exceeded the modulus.
+        # If the clock was reset at the same time, or if the counter had exceeded the modulus, the counter has not
+        # wrapped, and no increase counts as a gap.
         gap_limit = self.seq_modulus // 2
         if seq < previous_seq:
             cannot_wrap = is_clock_reset or previous_seq >= self.seq_modulus
@@ -343,7 +347,7 @@ class Parser(ABC):
             self.counts.lost += increase - 1
             return (GAP,)
         # A late frame was overtaken by a few others, and was counted as lost. Its counter is a little lower than the
-        # previous one. The first frames after a restart, which have low counters, are never taken for late frames.
+        # previous counter. The first frames after a restart, which have low counters, are never taken for late frames.
         decrease = (previous_seq - seq) % self.seq_modulus
         if decrease <= MAX_LATE_FRAMES and seq > MAX_LATE_FRAMES and not is_clock_reset:
             self._previous_seq = previous_seq
@@ -394,9 +398,9 @@ class DelimitedParser(Parser):
 
         The bytes are divided into pieces at the delimiters. Pieces that are longer than `max_length` are dropped.
 
-        The bytes after the last delimiter are an unfinished piece, the tail, which is stored for the next call. Of a
-        tail that is longer than `max_length`, only `max_length + 1` bytes are stored, so that the piece is too long
-        also when its end arrives. The other bytes are dropped.
+        The bytes after the last delimiter are an unfinished piece, the tail, which is stored for the next call. If the
+        tail is longer than `max_length`, only its first `max_length + 1` bytes are stored, and its other bytes are
+        dropped. The piece is therefore still too long when its end arrives.
         """
         *pieces, tail = (self._tail + data).split(self._delimiter)
         frames = []
@@ -419,12 +423,12 @@ class DelimitedParser(Parser):
             piece: The bytes between two delimiters.
 
         Raises:
-            ValueError, OverflowError, cobs.DecodeError: If the piece is rejected. The caller counts it.
+            ValueError, OverflowError, cobs.DecodeError: If the piece is rejected. The caller counts the rejected piece.
         """
 
 
 class StuffedParser(DelimitedParser):
-    """Parser of frames with byte stuffing. The bytes between two delimiters are expected to be one frame, or empty.
+    """Parser of frames with byte stuffing. Between two delimiters, one frame or no bytes are expected.
 
     Args:
         format: Description of the format, for the user.

@@ -24,10 +24,10 @@ name `t_us`, `t_ms` or `t_s` is the clock. The field `flags` contains bits such 
 (`isocharge.serve.frames.frame`). All other fields are channels.
 
 If a frame with a sync pattern is damaged, the parser searches for the next sync pattern, beginning one byte later. The
-parser does not skip the length of a frame, because an intact frame may begin only a few bytes later. An intact frame
-begins there if the pattern has occurred by chance inside another frame. In a stream with byte stuffing, all bytes
-between two delimiters are dropped if they are not an intact frame. In a datagram, only the damaged frames are dropped,
-unless the length of the datagram is wrong.
+parser does not skip the length of a whole frame, because an intact frame may begin only a few bytes later. This is the
+case if the first pattern was not the beginning of a frame, but occurred by chance inside another frame. In a stream
+with byte stuffing, all bytes between two delimiters are dropped if they are not an intact frame. In a datagram, only
+the damaged frames are dropped, unless the length of the datagram is wrong.
 """
 
 import re
@@ -63,7 +63,7 @@ STRUCT_FORMATS: dict[FieldType, str] = {
     "f32": "f",
     "f64": "d",
 }
-"""Format of each type of a field in the notation of the module `struct`.
+"""For each type of field: its format in the notation of the module `struct`.
 
 A number of three bytes is read as bytes, because `struct` has no format for such numbers.
 """
@@ -136,7 +136,7 @@ class Field(Settings, frozen=True, kw_only=True, omit_defaults=True):
 
     @property
     def modulus(self) -> int:
-        """Number of different values of an integer of this size, at which an unsigned counter wraps to 0."""
+        """Number of different values of an integer of this size. An unsigned counter wraps to 0 at this number."""
         return 1 << 8 * self.size
 
 
@@ -150,7 +150,7 @@ Framing = Literal["sync", "cobs", "slip", "hdlc", "datagram"]
 
 
 class FrameSection(Settings, frozen=True, tag_field="format"):
-    """Keys of the section `[frames]` that every format has. The keys describe how to request frames from the board.
+    """Keys of the section `[frames]` that all formats share. The keys describe how to request frames from the board.
 
     Attributes:
         request: Bytes that request one frame, in hexadecimal; None for a board that sends frames without a request.
@@ -276,8 +276,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
 
         Raises:
             ChecksumError: If the checksum is wrong.
-            ValueError: If the length, the sync pattern or a constant byte is wrong, or the frame counter or the clock
-                is not a number.
+            ValueError: If the length, the sync pattern or a constant byte is wrong, or if the frame counter or the
+                clock is not a number.
             OverflowError: If the frame counter or the clock is infinite.
         """
         if not self.pattern.fullmatch(data):
@@ -313,8 +313,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             parser = DatagramParser(self)
         else:
             stuffing = STUFFINGS[self.framing]
-            # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit is
-            # not exact, because it only prevents that an endless piece without a delimiter is stored.
+            # SLIP and HDLC at most double the length. COBS adds 1 byte, and 1 more for every 254 bytes. The limit need
+            # not be exact, because it only prevents the parser from storing an endless piece without a delimiter.
             parser = StuffedParser(
                 self.description,
                 stuffing.delimiter,
@@ -369,7 +369,8 @@ class DatagramParser(SyncParser):
         """Return the frames that one datagram contains.
 
         If the length of the datagram is not a multiple of the length of a frame, the whole datagram is rejected. A line
-        feed that follows the frames is ignored, because a UDP socket adds one to bytes that are all printable.
+        feed behind the frames is ignored, because a UDP socket adds a line feed to a datagram in which all bytes are
+        printable.
         """
         length = self.layout.length
         if len(data) % length == 1:

@@ -71,9 +71,9 @@ def clean_text(text: str) -> str:
 def _teleplot_content(text: str) -> str:
     """Convert a line of the program Teleplot to text with a name before each number.
 
-    A Teleplot line contains a name and one or more values, as in `>A:1000:800.9;1010:801.2§pC|g`. Before each value,
-    there may be its time in ms. A unit and flags may follow the last value. The result contains only the latest value
-    and its time, as in `t_ms:1010;"A":801.2§pC`.
+    A Teleplot line contains a name and one or more values, as in `>A:1000:800.9;1010:801.2§pC|g`. The time of a value,
+    in ms, may stand before the value. A unit and flags may follow the last value. The result contains only the latest
+    value and its time, as in `t_ms:1010;"A":801.2§pC`.
 
     The result is empty if the flags state that the value is a text (t) or a point in a plane (xy). A line that is no
     Teleplot line is returned unchanged.

@@ -1,4 +1,4 @@
-"""Parser for boards that send frames as lines of text, and function that writes such lines.
+"""Parser for boards that send frames as lines of text, and a function that writes frames as such lines.
 
 A board writes each frame as one line, or as a cycle of lines that together contain all values of the frame. The module
 `isocharge.serve.frames.text_lines` reads the numbers of each line. Lines with the same text between their numbers
@@ -11,8 +11,9 @@ In lines such as `1000,0,3.2` and `1000,1,4.1`, the second column is the number 
 its charge. Lines with the number of a channel are not recognised, because they could be mistaken for frames with three
 values. A frame counter without a name may look like the number of a channel during the first eight lines.
 
-Reading may start in the middle of a cycle. A cycle therefore begins with the line whose name is that of the frame
-counter, or else comes first in the order of names.
+Reading may start in the middle of a cycle. A cycle is therefore assumed to begin with the line that contains the frame
+counter. If there is no frame counter, it is assumed to begin with the line whose name comes first in alphabetical
+order.
 
 Reading may also start in the middle of a line. If the first line begins with a number, it is therefore dropped and
 counted as malformed. The first line of a file or a pipe is dropped, too, because its bytes usually come from a port,
@@ -20,13 +21,14 @@ for example from `cat /dev/ttyACM0`. A program that begins with a complete line 
 line first. No frame is then dropped.
 
 Text has no checksum, except for sentences in the style of NMEA 0183. The parser therefore cannot detect a damaged digit
-in an otherwise intact line. Lines between the frames that never change, such as the echo of a request, do not prevent
-the recognition of the layout.
+in an otherwise intact line. If lines that never change stand between the frames, such as the echo of a request, the
+layout is recognised all the same.
 
 A column with the name `seq` is the frame counter. A column with the name `t_us`, `t_ms` or `t_s` is the clock of the
-device. All other columns are channels. A frame counter wraps at one of `SEQ_MODULI`: at 256 until it exceeds 255, and
-then at 65536, unless it returns to a small number after 99, 999 or 9999. A clock in us or ms is assumed to have 32
-bits, and a clock in s is assumed to be a time of day.
+device. All other columns are channels. A frame counter is assumed to wrap at one of `SEQ_MODULI`: at 256 as long as it
+has not exceeded 255, and at 65536 afterwards. If the counter returns to a small number after 99, 999 or 9999, it is
+assumed to wrap at 100, 1000 or 10000. A clock in us or ms is assumed to have 32 bits, and a clock in s is assumed to be
+a time of day.
 """
 
 import json
@@ -59,16 +61,16 @@ CONTROL_CHARACTERS = bytes({*range(32)} - {*b"\t\x1b"})
 """Bytes that have no meaning at the ends of a line, such as the zero at the end of a C string, or STX and ETX."""
 
 MAX_CYCLE_LINES = 64
-"""Largest number of lines that make one frame, and of lines that are kept as possible headers."""
+"""Largest number of lines in one frame, and largest number of lines that are kept as possible headers."""
 
 RECOGNITION_REPEATS = 3
-"""Number of times in succession that a layout must occur before it is recognised."""
+"""Number of successive occurrences after which a layout is recognised."""
 
 MESSAGE_REPEATS = 10
-"""Number of times in succession that a layout that resembles a message must occur before it is recognised."""
+"""Number of successive occurrences after which a layout is recognised if its lines resemble messages."""
 
 SEQ_MODULI = (256, SEQ_MODULUS, 100, 1000, 10_000)
-"""Values at which a frame counter in text may wrap to 0: those of 8 and 16 bits, and those of two to four digits."""
+"""Values at which a frame counter in text may wrap to 0, for counters of 8 and 16 bits, and of two to four digits."""
 
 
 class Layout:
@@ -112,8 +114,8 @@ class TextParser(DelimitedParser):
 
         Args:
             columns: Names for the values that have no names in the lines; empty if they are not known.
-            meanings: Meaning of names that the device uses for its counter and its clock: for each such name, one of
-                `seq`, `t_us`, `t_ms` and `t_s`.
+            meanings: For each name that the device uses for its counter or its clock: the meaning of the name, which is
+                `seq`, `t_us`, `t_ms` or `t_s`.
         """
         super().__init__("text of a layout that is not clear yet", b"\n", MAX_LINE_LENGTH)
         self.layout: Layout | None = None
@@ -137,7 +139,7 @@ class TextParser(DelimitedParser):
     def reset(self) -> None:
         """Drop an unfinished frame, and treat the next line as the first line of another connection.
 
-        A layout that was recognised stays recognised.
+        The parser keeps a layout that it has recognised.
         """
         super().reset()
         self._drop_cycle()
@@ -170,7 +172,7 @@ class TextParser(DelimitedParser):
             return self._reject(size)
 
     def _store_comment(self, text: str) -> None:
-        """Store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header until a layout is recognised.
+        """While no layout is recognised, store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header.
 
         Args:
             text: The comment, or an empty text for a blank line.
@@ -246,7 +248,7 @@ class TextParser(DelimitedParser):
         self._cycle = []
 
     def _update_seq_modulus(self, seq: int) -> None:
-        """Infer from the next value of the frame counter the value `seq_modulus` at which the counter wraps to 0.
+        """Update `seq_modulus`, the value at which the frame counter wraps to 0, from the next value of the counter.
 
         If the counter decreases from 99, 255, 999, 9999 or 65535, it has wrapped, and the modulus is the next number,
         such as 100. If the counter reaches the present modulus, this modulus is wrong: a counter stays below its
@@ -266,8 +268,8 @@ class TextParser(DelimitedParser):
     def _collect_line(self, text: str, size: int) -> list[Frame]:
         """Collect a line until a layout is recognised, and then return the frames in the collected lines.
 
-        A line without numbers is stored as a possible header. Once `MAX_CYCLE_LINES` possible headers are stored,
-        further lines without numbers are counted as rejected, too.
+        A line without numbers is stored as a possible header. Once `MAX_CYCLE_LINES` possible headers are stored, each
+        further line without numbers is also counted as rejected.
 
         Args:
             text: The line.
@@ -304,8 +306,8 @@ class TextParser(DelimitedParser):
     def _recognised_layout(self, lines: Sequence[Line]) -> Layout | None:
         """Return the layout of the frames, with names from the device file or from the latest header.
 
-        The result is None if the layout cannot be recognised yet. It is also None if the number of columns in the
-        device file differs from that of the unnamed values in a line, and no header names these values.
+        The result is None if the layout cannot be recognised yet. The result is also None if the device file names more
+        or fewer columns than a line has values without names, and no header names these values.
 
         Args:
             lines: The lines since the beginning.
@@ -328,7 +330,7 @@ class TextParser(DelimitedParser):
         return layout
 
     def _set_layout(self, layout: Layout) -> None:
-        """Set the layout, the attribute `format`, which describes the layout, and the modulus of the clock."""
+        """Set the layout, its description in the attribute `format`, and the modulus of the clock."""
         self.layout = layout
         # A clock in s is assumed to be a time of day, which wraps after 86400 s. Other clocks wrap after 2^32 counts.
         unit_us = round(layout.columns.clock_unit_us)
@@ -342,10 +344,10 @@ class TextParser(DelimitedParser):
 
 
 def _decoded(line: bytes) -> str:
-    """Decode a line in UTF-8, or else in Latin-1, in which some instruments write the signs of micro and degree.
+    """Decode a line from UTF-8, or else from Latin-1, in which some instruments write the micro and degree signs.
 
     Raises:
-        UnicodeDecodeError: If the line is not in UTF-8, and contains other signs of Latin-1.
+        UnicodeDecodeError: If the line is not in UTF-8, and contains characters other than ASCII and these two signs.
     """
     try:
         return line.decode()
@@ -360,12 +362,12 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     """Return the lines of one frame; empty if the lines do not repeat, or if it is not clear which lines are frames.
 
     A cycle is a sequence of lines that repeats. A cycle is recognised if the last lines consist of several equal
-    cycles. Lines are equal if their skeletons are equal. A cycle contains the lines after the previous occurrence of
-    the last line, up to the last line itself.
+    cycles. Lines are equal if their skeletons are equal. The last cycle consists of the lines after the previous
+    occurrence of the last line, including the last line itself.
 
-    If lines occur several times in a cycle, the most frequent line is a frame. If all lines of a cycle differ and every
-    value has a name, a frame consists of all lines of a cycle. If all lines differ and some value has no name, a frame
-    is a single line, and the other lines of the cycle never change.
+    If some lines occur several times in a cycle, the most frequent line is a frame. If all lines of a cycle differ and
+    every value has a name, a frame consists of all lines of a cycle. If all lines of a cycle differ and some value has
+    no name, a frame is the only line of the cycle whose text changes.
 
     Args:
         lines: The lines since the beginning.
@@ -398,9 +400,9 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
 
 
 def _has_hexadecimal_digits(layout: Layout, lines: Sequence[Line]) -> bool:
-    """Return whether the numbers are hexadecimal without the prefix 0x, because other lines have digits such as 07FD.
+    """Return whether digits such as 07FD in other lines show that the numbers are hexadecimal without the prefix 0x.
 
-    At least every tenth line must have such digits, because a single damaged line may have them, too.
+    At least one line in ten must contain such digits, because a single damaged line may also contain them.
 
     Args:
         layout: Layout of a frame of one line.
@@ -417,16 +419,16 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
     """Return whether each line seems to contain the number of a channel and only the charge of this channel.
 
     The numbers of the channels increase by 1 from line to line and begin again after the last channel, as in
-    `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is taken for such numbers if it fulfils these
-    conditions:
+    `1000,0,3.2`, `1000,1,4.1`, `1000,2,3.7` and `1005,0,3.3`. A column is assumed to contain the numbers of channels if
+    it fulfils these conditions:
 
     - The column contains three to eight different numbers, which are consecutive whole numbers. The smallest number is
       below 100.
     - At least half of the steps from line to line lead to the next number. Other steps may be due to missing lines.
     - The column does not have the name of a frame counter or of an electrode, such as A.
     - The other columns cannot be the charges of a film, because fewer than three of them sometimes decrease. A film has
-      at least three charges, which increase and decrease, while counters and clocks only increase. However, if all of
-      three or more other columns are constant, they may be the charges of an untouched film.
+      at least three charges, which increase and decrease, while counters and clocks only increase. However, if there
+      are three or more other columns and all of them are constant, they may be the charges of an untouched film.
 
     A frame counter without a name also fulfils these conditions in its first eight lines.
 
@@ -467,12 +469,12 @@ def _counts_up_repeatedly(column: Array) -> bool:
 
 
 def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
-    """Return the index of the line with which a frame begins in repeated cycles of lines.
+    """Find the line with which a frame begins in repeated cycles of lines, and return its index.
 
     Reading may start within a cycle. If every line has a clock, the first line is chosen so that the clocks of a frame
     differ least. If some line has no clock, the first line is the one that begins with the counter. Without a counter,
-    it is the line that only contains the clock. Without both, it is the line whose first name comes first in
-    alphabetical order.
+    it is the line that contains only the clock. If there is neither a counter nor a clock, it is the line whose first
+    name comes first in alphabetical order.
 
     Args:
         lines: Lines of whole cycles, in which every value has a name.
@@ -485,8 +487,9 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
     def sort_key(first: int) -> tuple[float, bool, str]:
         """Return the sort key of the line with index `first`. A frame begins with the line with the smallest key.
 
-        The key consists of the time from the first to the last line of a frame that would begin with this line (0 if
-        some line has no clock), whether the line begins without a counter, and the first name in the line.
+        The key has three elements. The first element is the time from the first to the last line of a frame that would
+        begin with this line, or 0 if some line has no clock. The second element states whether the line begins without
+        a counter. The third element is the first name in the line.
         """
         frame = fields_of_lines[first : first + cycle_length]
         clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]

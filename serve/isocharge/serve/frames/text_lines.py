@@ -1,7 +1,7 @@
 """Numbers in the lines of text that boards send.
 
-A line consists of numbers and of its skeleton, which is the text between the numbers. Lines with the same skeleton are
-frames of one layout, in whatever notation the board writes them:
+A line consists of numbers and a skeleton. The skeleton is the text between the numbers. Lines with the same skeleton
+are frames with the same layout. Boards write numbers and names in various notations, for example:
 
 | line | names | numbers |
 |---|---|---|
@@ -12,12 +12,13 @@ frames of one layout, in whatever notation the board writes them:
 | `{"charge": {"A": 801.2, "B": 3}}` | A, B | 801.2, 3 |
 
 A word directly before a number is the name of the number. If different words and numbers alternate, as in `C,7,A,3` and
-`7 C, 3 A`, the words are names, too. Digits in a word, as in `ch3`, are not a number, and an index such as that in
-`ch 3: 801` is a name. Words that are neither names nor followed by a colon or an equals sign may change from line to
-line, except units of charge and voltage. Quotes around a number have no meaning.
+`7 C, 3 A`, the words are names, too. Digits inside a word, as in `ch3`, are not a number. The index of a channel, such
+as the 3 in `ch 3: 801`, is a name. All lines with one skeleton contain the same names, the same units of charge and
+voltage, and the same words before a colon or an equals sign. All other words may change from line to line. Quotes
+around a number have no meaning.
 
-Names and units are found with regular expressions in the shape of a line, which has one symbol for each part of the
-line. For example, the shape of `A: 801.2 pC, B: -799.5 pC` is `k:0u,k:0u`.
+The shape of a line is a text with one symbol for each part of the line. Regular expressions find the names and the
+units in this shape. For example, the shape of `A: 801.2 pC, B: -799.5 pC` is `k:0u,k:0u`.
 """
 
 import math
@@ -44,16 +45,16 @@ _TIME = (
 """Regular expression of a time in whole seconds, with or without a date."""
 
 _FRACTION = r"(?:\.[0-9]+(?:[.,][0-9]{3}(?=\]))?|,[0-9]{3}(?=\s)|,[0-9]+(?=;))"
-"""Regular expression of the fraction of a second, as in 56.789, 56.789,012], 56,789 before a blank, or 56,7;."""
+"""Regular expression of a fraction of a second, as in `56.789`, `56.789,012]`, `56,7;`, or `56,789` before a blank."""
 
 _ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?(?![\w:])"
-"""Regular expression of the time zone after a time, which may be missing."""
+"""Regular expression of the time zone after a time. The time zone may be missing."""
 
 _NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w)))"
 """Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
 
 _NUMBER_WITH_COMMA = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
-"""Regular expression of a decimal number, which may have a decimal comma instead of a decimal point."""
+"""Regular expression of a decimal number that may have a decimal comma instead of a decimal point."""
 
 _PATTERNS = {
     "coarse_time": rf"(?<![\w.:]){_TIME}(?!{_FRACTION}{_ZONE}){_ZONE}",  # whole seconds, too coarse for a clock
@@ -81,38 +82,38 @@ _SYMBOLS = {
     "number": "0",
     "word": "w",
 }
-"""Symbol that stands for a part of a line in the shape of the line, such as `k=0,k=0`, by the kind of the part.
+"""For each kind of part: the symbol that stands for the part in the shape of a line, such as `k=0,k=0`.
 
-A mark stands for itself. The symbol of a word or key that is a unit of charge or voltage is u.
+A mark stands for itself. A word or a key that is a unit of charge or voltage has the symbol u.
 """
 
 
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
-"""Names of a time of day, in seconds since midnight, and of the time in a log prefix such as `I (1234)`."""
+"""Name of a time of day, in seconds since midnight, and name of the time in a log prefix such as `I (1234)`."""
 
 _WORD_BEFORE = r"(?P<word>[kquw])\W*(?P<number>[0t])"
-"""Regular expression, for the shape of a line, of the last word before a number."""
+"""Regular expression that finds the last word before a number in the shape of a line."""
 
 _WORD_BEHIND = r"(?P<number>[0t])\W*(?P<word>[kquw])"
-"""Regular expression, for the shape of a line, of the first word behind a number."""
+"""Regular expression that finds the first word behind a number in the shape of a line."""
 
 _SAME_COLUMN = r"(?:q|[^\w,;|\[(])*"
-"""Regular expression, for the shape of a line, of parts that neither separate columns nor begin a list."""
+"""Regular expression of parts in the shape of a line that neither separate columns nor begin a list."""
 
 _NEAREST_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}(?P<number>[0t])"
-"""Regular expression, for the shape of a line, of the last word before a number in the same column."""
+"""Regular expression that finds the last word before a number, in the same column, in the shape of a line."""
 
 _SECOND_NAME = rf"(?P<word>[kuw]){_SAME_COLUMN}[(\[]?[kuw]{_SAME_COLUMN}(?P<number>[0t])"
-"""Regular expression, for the shape of a line, of the last word but one before a number in the same column."""
+"""Regular expression that finds the last word but one before a number, in the same column, in the shape of a line."""
 
 _UNIT_BEHIND = r"(?P<number>[0t])(?:[\])}]*,?k)?[\]\[(){}:=]*(?P<word>[quw])"
-"""Regular expression, for the shape of a line, of a word behind a number, which may be its unit.
+"""Regular expression that finds a word behind a number in the shape of a line. This word may be the unit.
 
-A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`, and the unit may have brackets.
+A key may stand between the number and the unit, as in `"value": 3.5, "unit": "nC"`, and the unit may be in brackets.
 """
 
 _UNIT_BEFORE = r"[kquw,]\W*(?P<word>[kquw])(?:\W*k)?\W*(?P<number>[0t])"
-"""Regular expression, for the shape of a line, of a word between the name and the number, which may be its unit.
+"""Regular expression that finds a word between a name and a number in the shape of a line. This word may be the unit.
 
 A comma may take the place of the name, as in `"A": {"raw": 512, "nC": 3.5}`, and a key may stand between the unit and
 the number, as in `"unit": "nC", "value": 3.5`.
@@ -125,10 +126,10 @@ _UNCLEAR = (
     r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
     r"|(?:[:=>]\s*[-+]?[0-9]+,[0-9]++(?!\s*[:=]|,[-+.0-9]).*){2}"
 )
-"""Regular expression of a text whose numbers are not clear.
+"""Regular expression of a text in which a minus or a comma may have two meanings, so that its numbers are not clear.
 
 A minus after a number, as in `3.5 - 2.5` and `3.5-`, may be a sign or a separator. Commas behind several names, as in
-`A=18,537 B=18,402 T=23.5`, may be decimal commas or separators, of thousands or of columns.
+`A=18,537 B=18,402 T=23.5`, may be decimal commas, separators of thousands, or separators of columns.
 """
 
 _SEPARATING_COMMA = (
@@ -140,7 +141,10 @@ _SEPARATING_COMMA = (
 """Regular expression of a text that shows that the commas of a line are separators."""
 
 _DECIMAL_COMMA = rf"(?P<time>{_TIME}{_FRACTION}?,?)|(?<=[0-9]),(?=[0-9])"
-"""Regular expression of a comma between digits, or of a time, in which a comma is no decimal comma."""
+"""Regular expression of a comma between digits.
+
+The expression also matches a whole time, because a comma in a time is not a decimal comma.
+"""
 
 _CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}
 """Units of charge and voltage, except C, which may be the name of an electrode."""
@@ -179,8 +183,8 @@ class Line(NamedTuple):
 
     Attributes:
         text: The line.
-        skeleton: Regular expressions of the parts and of the blanks between them. A part that is the same in each line
-            of a layout has a regular expression that matches only this part.
+        skeleton: Regular expressions of the parts of the line and of the blanks between the parts. If a part is the
+            same in all lines of a layout, its regular expression matches only this part.
         names: Name of each number; empty for a number without a name.
         starts: Position in the line at which each number begins.
         is_prose: Whether the line resembles a message; see `_is_prose`.
@@ -196,7 +200,7 @@ class Line(NamedTuple):
 
     @property
     def pattern(self) -> re.Pattern[str]:
-        """Regular expression of all lines with the skeleton of the line. Each number is a group."""
+        """Regular expression that matches every line with the same skeleton. Each number is a group."""
         return re.compile("".join(self.skeleton) + r"[\s,;]*+")
 
 
@@ -207,9 +211,9 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
 
     Args:
         text: The line, as `clean_text` returns it.
-        has_header: Whether a header names the numbers, so that words that alternate with the numbers are not names.
-        meanings: For each name that the board uses for a counter or a clock: its name in isocharge, such as `t_ms`.
-            Such a name is a name even if no other number of the line has one.
+        has_header: Whether a header names the numbers. Words that alternate with the numbers are then not names.
+        meanings: For each name that the board uses for a counter or a clock: the name in isocharge, such as `t_ms`. The
+            names of counters and clocks are accepted even if no other number of the line has a name.
 
     Raises:
         ValueError: If the line contains characters that are not printable.
@@ -239,14 +243,14 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
 def _has_decimal_commas(text: str) -> bool:
     """Return whether the commas between digits are decimal commas, as in `3,1;-2,0` and `A: 3,1 pC, B: -2,0 pC`.
 
-    Commas are not decimal commas but separators in a line to which one of these statements applies:
+    The commas are separators instead of decimal commas if one of these statements applies to the line:
 
-    - A number has a decimal point or two commas, or a comma stands before a sign, beside a blank, before a name, or
-      behind a name that ends with a digit. `_SEPARATING_COMMA` describes these cases.
-    - The line contains only two numbers, which only a comma separates, as in `4,3`. In `A:4,3`, however, the comma is a
-      decimal comma, because a name belongs to one number.
-    - The line has brackets, as in `(4,3) (5,2)`. The commas are decimal commas all the same if there are several, and
-      if a colon or an equals sign stands before each number with a comma.
+    - A number has a decimal point or two commas, or a comma stands in one of these places: before a sign, before a
+      name, beside a blank, or behind a name that ends with a digit. `_SEPARATING_COMMA` describes these cases.
+    - The line contains only two numbers, with only a comma between them, as in `4,3`. In `A:4,3`, however, the comma is
+      a decimal comma, because a name belongs to one number.
+    - The line has brackets, as in `(4,3) (5,2)`. Even in a line with brackets, several commas are decimal commas if
+      each number with a comma follows a colon or an equals sign.
     """
     text = re.sub(f"{_TIME}{_FRACTION}?(?:{_ZONE})?", "", text)
     number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))  # `4,3` counts as one number
@@ -261,9 +265,9 @@ def _has_decimal_commas(text: str) -> bool:
 
 
 def _parts(text: str) -> list[_Part]:
-    """Divide a line into its parts; empty for a line in which a minus or a comma may have two meanings.
+    """Return the parts of a line; empty if a minus or a comma in the line may have two meanings.
 
-    A number that is the index of a channel becomes a key, because it is the name of the number behind it.
+    If a number is the index of a channel, it becomes a key, because the index is the name of the next number.
 
     Args:
         text: The line, with decimal points instead of decimal commas.
@@ -380,12 +384,12 @@ def _is_prose(parts: list[_Part]) -> bool:
 
 
 def _words(parts: list[_Part], pattern: str) -> list[str]:
-    """Return the name of each time, and the word that belongs to each other number; empty for a number without a word.
+    """Return the word that belongs to each number, or the name of each time; empty for a number without a word.
 
     Args:
         parts: Parts of the line.
-        pattern: Regular expression for the shape of the line, in which the groups `word` and `number` are a word and
-            the number to which it belongs.
+        pattern: Regular expression for the shape of the line. Its group `word` matches a word, and its group `number`
+            matches the number to which the word belongs.
     """
     words = {match.start("number"): parts[match.start("word")].name for match in re.finditer(pattern, _shape(parts))}
     return [
@@ -401,14 +405,13 @@ def _unique(names: list[str]) -> list[str]:
 
 
 def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
-    """Return the names of the numbers in a line in which names and numbers alternate; empty for another line.
+    """Return the names of the numbers if names and numbers alternate in the line; otherwise, return an empty list.
 
-    The name of a number is the word that is next to the number, either before each number, as in `C,7,A,3` and
-    `C[7] A[3]`, or behind each number, as in `7 C, 3 A`. If two of the words are equal, no word is a name, because
-    words that repeat are units or states. Words of another meaning that alternate with the numbers are taken for names,
-    too.
+    The names are the words next to the numbers. They stand either before all numbers, as in `C,7,A,3` and `C[7] A[3]`,
+    or behind all numbers, as in `7 C, 3 A`. If two of the words are equal, no word is a name, because words that repeat
+    are units or states. Words with another meaning are also taken for names if they alternate with the numbers.
 
-    If a header names the numbers, the words are no names but the contents of other columns. The exception is a line
+    If a header names the numbers, the words are not names but the contents of other columns. The exception is a line
     with a single word and a single number, as in `A,3.5`: even below a header, the word is the name of the number.
 
     Args:
@@ -428,7 +431,7 @@ def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
 
 
 def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
-    """Return the name of each number, which is an empty text for a number without a name.
+    """Return the name of each number, or an empty text for a number without a name.
 
     The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. The
     name must stand behind the previous number and behind the previous separator. If several numbers have the same
@@ -498,9 +501,9 @@ def _units(parts: list[_Part], names: list[str]) -> list[str]:
 def _with_units(names: list[str], units: list[str], counters: Container[str]) -> list[str]:
     """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
 
-    The unit pC is not added, and counters and clocks have no unit of charge. If two numbers follow each of several
-    names, and only the second number has a unit, the name is moved to the second number. For example, the names of
-    `A: 512 (3.5 nC), B: 498 (4.1 nC)` become "", `A_nC`, "" and `B_nC`.
+    The unit pC is not added, and no unit is added to counters and clocks. A name may be followed by a number without a
+    unit and then by a number with a unit. If this is the case for several names, each of these names is moved to its
+    second number. For example, the names of `A: 512 (3.5 nC), B: 498 (4.1 nC)` become "", `A_nC`, "" and `B_nC`.
 
     Args:
         names: Name of each number; empty for a number without a name.
@@ -531,7 +534,7 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
     """Return the numbers in a line; None if the line has another skeleton.
 
     Args:
-        pattern: The `pattern` of a line with the skeleton.
+        pattern: The `pattern` of a `Line` that has the expected skeleton.
         text: The line.
     """
     match = pattern.fullmatch(text)
@@ -567,11 +570,12 @@ def _separator(text: Container[str]) -> str | None:
 def header_names(header: str, line: Line) -> tuple[str, ...]:
     """Return the names that a header states for the numbers without names in a line.
 
-    The names begin with letters, and differ from each other. The result is empty if the text is no header of the line,
-    because it states no such name for one of the numbers.
+    The names begin with letters, and differ from each other. If the text states no such name for one of the numbers, it
+    is no header of the line, and the result is empty.
 
-    A header may have one name for each number without a name, or one name for each column of the line. The columns of
-    texts and of numbers with names are then ignored, and so are the mark of a comment and a label before the names.
+    A header may have one name for each number without a name, or one name for each column of the line. In the second
+    case, the columns that contain texts or numbers with names are ignored. The mark of a comment and a label before the
+    names are always ignored.
 
     Args:
         header: A line without numbers.
@@ -585,8 +589,8 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
         return ()
     columns = header.split(separator)
     if len(columns) != len(starts):
-        # The header has one name for each column of the line. Select the columns that contain the numbers. The text
-        # of the line up to the first character of a number consists of as many columns as the position of the number.
+        # The header has one name for each column of the line. Select the columns that contain the numbers. If a number
+        # is in the n-th column, the text of the line up to the first character of the number has n columns.
         column_counts = [len(line.text[: start + 1].split(line_separator)) for start in starts]
         columns = [columns[count - 1] for count in column_counts if count <= len(columns)]
     # A label with a colon may stand before a name, as in `Data: A, B, C`.

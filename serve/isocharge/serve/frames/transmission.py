@@ -7,7 +7,7 @@ Byte stuffing ensures that the delimiter between frames never occurs inside a fr
 - SLIP (RFC 1055) and the asynchronous framing of HDLC (RFC 1662) separate frames by a reserved byte. If the reserved
   byte occurs in the data, two other bytes are sent in its place.
 
-The package `anycrc` computes the cyclic redundancy checks (CRC), which have the names of the catalogue of parametrised
+The package `anycrc` computes the cyclic redundancy checks (CRC). Their names are those in the catalogue of parametrised
 CRC algorithms (Cook, https://reveng.sourceforge.io/crc-catalogue/).
 """
 
@@ -51,8 +51,8 @@ def _slip_decode(stuffed: bytes) -> bytes:
 def _hdlc_decode(stuffed: bytes) -> bytes:
     """Remove the byte stuffing of HDLC.
 
-    After the byte 7D, the encoder has inverted the bit 0x20 of the next byte. The decoder therefore drops the byte 7D,
-    and inverts the bit 0x20 of the next byte again.
+    The encoder has inverted the bit 0x20 of every byte that follows a byte 7D. The decoder therefore drops the byte 7D,
+    and inverts the bit 0x20 of the following byte again.
 
     Raises:
         ValueError: If the byte 7D is not followed by another byte.
@@ -90,8 +90,8 @@ class Checksum(NamedTuple):
 def _fletcher_16(data: bytes) -> int:
     """Compute Fletcher's checksum (1982), which has two bytes.
 
-    The low byte of the checksum is the sum of all data bytes, modulo 255. Each time a data byte was added to the low
-    byte, the new low byte is added to the high byte, modulo 255.
+    The low byte of the checksum is the sum of all data bytes, modulo 255. After each data byte, the new low byte is
+    added to the high byte, modulo 255.
     """
     byte_sum = 0
     sum_of_sums = 0
@@ -118,7 +118,7 @@ checksum `sum-8/inverted` is the sum of the bytes with every bit inverted.
 
 
 def _crcs() -> Iterator[tuple[str, Checksum]]:
-    """Yield each CRC of one to four bytes and each of its names, such as `crc-16/modbus` for `CRC16-MODBUS`."""
+    """Yield each CRC of one to four bytes under each of its names, such as `crc-16/modbus` for `CRC16-MODBUS`."""
     for name in (*anycrc.models, *anycrc.aliases):
         match = re.fullmatch(r"CRC(8|16|24|32)(?:-(.+))?", name)
         if match is not None:
