@@ -34,7 +34,7 @@ CHANNEL = "channel"
 
 
 def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.04) -> Iterator[tuple[str, float]]:
-    """Yield the fields that the values of consecutive frames may belong to: the frame counter, then a clock.
+    """Yield the possible meanings of a number from its values in consecutive frames: first the counter, then a clock.
 
     A counter increases by 1. A clock has one of the usual tick rates of boards. At about 1000 frames per second, a
     clock in ms also increases by 1, but it repeats some of its values. Nothing is yielded if the values are constant,
@@ -43,8 +43,8 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
         frame_rate_Hz: Number of frames per second, Hz.
-        tolerance: Largest relative deviation of a tick rate from a usual tick rate. It is large, because frames
-            arrive in bursts.
+        tolerance: Largest relative deviation of a tick rate from a usual tick rate. The default is large, because
+            frames arrive in bursts.
 
     Yields:
         The name of the field, which is `seq`, `t_s`, `t_ms` or `t_us`, and the value of one tick in the unit of this
@@ -77,9 +77,10 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
 
 
 def count_wraps(steps: Array) -> int:
-    """Return how often a number wraps, which causes a large step back.
+    """Return how often a number wraps. Each wrap causes a large step back.
 
-    A damaged value also causes a large step back, but causes a large step forwards, too.
+    A damaged value also causes a large step back, but it causes a large step forwards, too. Such a pair of steps is not
+    counted.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -98,9 +99,9 @@ class Weights:
         channel_group: Contribution of a group of adjacent channels of one type.
         channel: Contribution of a channel, in addition to the bits of its steps.
         constant: Contribution of a constant byte without a meaning, or of a constant channel.
-        constant_high: Contribution of a constant byte of a counter or clock of three bytes, unless the byte is 0. It is
-            larger than `constant`, because counters of two bytes are more usual, and one that is too wide causes false
-            restarts.
+        constant_high: Contribution of each constant byte in a counter or clock of three bytes, unless the byte is 0.
+            This weight is larger than `constant`, because counters of two bytes are more usual, and a counter that is
+            read with too many bytes causes false restarts.
         noise: Contribution of a varying byte without a meaning, and of a byte outside of all frames.
         fraction: Share of the bits of a floating-point number that belong to its significant digits, dimensionless.
     """
@@ -119,10 +120,10 @@ class Part(NamedTuple):
     Adjacent channels of one type form a group of channels.
 
     Attributes:
-        name: Name of the field in a device file, but `CHANNEL` for all channels; empty for padding.
+        name: Name of the field in a device file; `CHANNEL` for every channel, and empty for padding.
         type_name: Type of the number, as in device files.
         size: Number of bytes.
-        score: Contribution to the score of a division into parts, bits. If the part begins a group of channels, the
+        score: Contribution of the part to the score of a division, bits. If the part begins a group of channels, the
             contribution of the group is not included.
         is_constant: Whether the part is a channel with a constant value. Such a channel does not begin a group.
         scale: Value of one tick of a clock, in the unit of its name.
@@ -143,8 +144,8 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
     A part is a single byte without a meaning (padding), or a number of one of the types in `STRUCT_FORMATS`.
 
     Args:
-        rows: Bytes of the frames, followed by the `LARGEST_SIZE` bytes behind each frame, shape (n, length +
-            `LARGEST_SIZE`). A number that begins near the end of a frame ends in these bytes.
+        rows: Bytes of each frame, followed by the next `LARGEST_SIZE` bytes of the stream, shape (n, length +
+            `LARGEST_SIZE`). A number that begins near the end of a frame may end in the next bytes.
         order: Byte order of the numbers.
         frame_rate_Hz: Number of frames per second, Hz, from which the tick rate of a clock follows.
 
@@ -173,13 +174,14 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
 def _number_parts(
     number_bytes: Bytes, constant_bytes: NDArray[np.int64], type_name: FieldType, frame_rate_Hz: float
 ) -> Iterator[Part]:
-    """Yield the possible meanings of some bytes of each frame, under the assumption that they are a number of a type.
+    """Yield the possible meanings of some bytes of each frame if these bytes are a number of a given type.
 
     Every number may be a channel, and some numbers may also be the frame counter or a clock. Nothing is yielded for
     floating-point numbers that are implausibly small or large.
 
-    Each part has a score in bits, which is lower for a more probable part. The score of a channel is the mean number of
-    bits that its steps from frame to frame need, because the bytes of a true number change little.
+    Each part has a score in bits, which is lower for a more probable part. The score of a channel grows with the mean
+    number of bits that are needed to encode its steps from frame to frame. This number is small for a true channel,
+    because its value changes little.
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
@@ -214,13 +216,13 @@ def _number_parts(
 def _counter_or_clock(
     steps: Array, constant_bytes: NDArray[np.int64], type_name: FieldType, unit: float, frame_rate_Hz: float
 ) -> Part | None:
-    """Return the part of a frame whose number is the frame counter or a clock, or None if the number can be neither.
+    """Return the part for a number that may be the frame counter or a clock; None if the number can be neither of them.
 
-    The score of the part, in bits, is lower for a more probable part. It is the mean number of bits that are needed to
-    encode a value if the previous value is known. Because a counter increases by 1 in every frame, its value follows
-    from the previous value, so that the score of a counter is 0. The score of a clock grows with the deviations of its
-    steps from the median step. Two corrections make a number of three bytes less probable, and a clock of eight bytes
-    more probable.
+    The score of the part, in bits, is lower for a more probable part. The score is the mean number of bits that are
+    needed to encode a value if the previous value is known. Because a counter increases by 1 in every frame, its value
+    follows from the previous value, so that the score of a counter is 0. The score of a clock grows with the deviations
+    of its steps from the median step. Two corrections make a number of three bytes less probable, and a clock of eight
+    bytes more probable.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).
@@ -269,7 +271,8 @@ def split_frame(
             checksum is not used.
         sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
             lengths have the lowest score, the first of them is chosen.
-        checksum_start: First byte that the checksum covers. It covers all bytes of a number or none.
+        checksum_start: First byte that the checksum covers. The checksum covers either all bytes of a number or none of
+            them.
 
     Returns:
         The score in bits, the parts after the sync pattern, and the length of the sync pattern in bytes.
@@ -318,13 +321,14 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
 
     Args:
         number_bytes: Bytes of the number, the lowest first, shape (n, size).
-        type_name: Type of the number: "f" for floating-point, "u" for unsigned or "i" for signed, and the size in bits.
+        type_name: Type of the number, such as "u16": "f" (floating-point), "u" (unsigned) or "i" (signed), and the size
+            in bits.
     """
     size = number_bytes.shape[1]
     if type_name[0] == "f":
         return number_bytes.view(f"<f{size}")[:, 0].astype(float)
-    # Integers may have any size from 1 to 8 bytes. They are read as signed numbers of 8 bytes, in which low bytes of 0
-    # were added. Each added byte multiplies the number by 256.
+    # Integers may have any size from 1 to 8 bytes. Low bytes of 0 are added, and the result is read as a signed number
+    # of 8 bytes. Each added byte multiplies the number by 256.
     added_count = 8 - size
     eight_bytes = np.pad(number_bytes, [(0, 0), (added_count, 0)])
     if type_name[0] == "u":
@@ -336,7 +340,7 @@ def _values(number_bytes: Bytes, type_name: str) -> Array:
 def _bits(steps: Array, unit: float, size: int) -> float:
     """Return the mean number of bits that are needed to encode the step of a number from one frame to the next.
 
-    No step is counted with more bits than the number itself has.
+    Each step counts at most as many bits as the number itself has.
 
     Args:
         steps: Differences of the values of consecutive frames, shape (n,).

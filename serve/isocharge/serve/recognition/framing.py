@@ -43,7 +43,7 @@ COVERED_SHARE = 0.4
 """Smallest share of a stream that frames of one length must cover, dimensionless."""
 
 MAX_CONSTANT_BYTES = 16
-"""Largest number of constant bytes that are tried as the beginning of a frame, or of the bytes under a checksum."""
+"""Largest number of constant bytes that are tried as the first byte of a frame, or as the first under a checksum."""
 
 
 class FrameDivision(NamedTuple):
@@ -52,8 +52,8 @@ class FrameDivision(NamedTuple):
     Attributes:
         framing: Kind of framing, as in device files.
         stream: All bytes of the stream, shape (n,).
-        starts: Positions in the stream that are at the same distance from the beginnings of the frames, shape
-            (frames,).
+        starts: One position in the stream for each frame, shape (frames,). All positions have the same distance from
+            the beginnings of their frames.
         length: Number of bytes in a frame.
     """
 
@@ -73,7 +73,7 @@ class FrameDivision(NamedTuple):
         A frame is left out if it is too close to the end of the stream.
 
         Args:
-            distance: Distance of the beginnings of the frames from `starts`, bytes.
+            distance: Distance from `starts` to the beginnings of the frames, bytes.
             next_bytes: Number of bytes behind each frame that are also returned.
         """
         starts = self.starts + distance
@@ -90,7 +90,7 @@ def usual_bytes(rows: Bytes) -> tuple[Bytes, NDArray[np.bool_]]:
         rows: Bytes of the frames, shape (n, length).
 
     Returns:
-        The most frequent bytes, and whether each of them is constant, each of shape (length,).
+        Two arrays of shape (length,): the most frequent bytes, and whether each of these bytes is constant.
     """
     usual = np.array([np.bincount(column).argmax() for column in rows.T], np.uint8)
     share_of_frames = (rows == usual).mean(axis=0)
@@ -115,8 +115,8 @@ def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Itera
     """
     data = b"".join(chunks)[:MAX_EXAMINED_BYTES]
     if are_datagrams:
-        # The length of a frame divides the lengths of nearly all datagrams. A line feed may follow the frames of the
-        # others; see `DatagramParser`.
+        # The length of a frame divides the lengths of nearly all datagrams. A line feed may follow the frames in the
+        # other datagrams; see `DatagramParser`.
         divisions = []
         for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
             whole_datagrams = [chunk for chunk in chunks if len(chunk) % length == 0]
@@ -182,8 +182,8 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
     therefore assumed to begin at every repetition of a byte or pair. For each frame length, the byte or pair whose
-    frames would cover the largest share of the stream is chosen. Only the lengths with the largest shares are yielded,
-    because the examination of a division takes long.
+    frames would cover the largest share of the stream is chosen. Only the divisions with the largest shares are
+    yielded, because it takes long to examine a division.
 
     Args:
         data: Bytes of the stream.
@@ -239,7 +239,7 @@ class Check(NamedTuple):
         return CHECKSUMS[self.name].size
 
     def is_correct(self, frame: bytes) -> bool:
-        """Return whether a frame ends with this checksum of its other bytes."""
+        """Return whether the checksum at the end of a frame is correct for the other bytes of the frame."""
         computed = CHECKSUMS[self.name].compute(frame[self.start : -self.size])
         return computed == int.from_bytes(frame[-self.size :], self.order)
 

@@ -51,7 +51,7 @@ def described_frames_section(
     The function tries the kinds of framing from the most certain to the least certain kind, until the frames can be
     described with one of them. A framing is the way in which the beginnings of frames are marked. If several
     descriptions with the same kind of framing are possible, the description with the lowest score is returned. The
-    result is None if no such frames are recognised.
+    result is None if no frames of fixed length are recognised.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -136,7 +136,7 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
 def _possible_distances(division: FrameDivision) -> list[int]:
     """Return the possible distances of the beginnings of the frames from `division.starts`, bytes.
 
-    A frame begins with its sync pattern, so that it may begin at any byte that may belong to the pattern.
+    A frame begins with its sync pattern. Each byte that may belong to the pattern may therefore be the first byte.
     """
     distances: list[int] = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist()
     return distances
@@ -188,7 +188,7 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     """Recognise the format of a board, and return the section `[frames]` that describes this format in a device file.
 
     The function first tries the binary frames of isocharge and lines of text, and then other frames of fixed length.
-    Bytes that are mostly printable characters are never taken for other frames.
+    Bytes that are mostly printable characters are never taken for frames of fixed length.
 
     Args:
         chunks: Received bytes, divided as they arrived.
@@ -221,12 +221,12 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
 
 
 def _is_text(data: bytes, min_share: float = 0.85) -> bool:
-    """Return whether bytes are text, which is never a binary format.
+    """Return whether bytes are text, and therefore no frames in a binary format.
 
     Args:
         data: The bytes.
-        min_share: Smallest share of printable characters in text. The other bytes may be damaged, letters that are not
-            ASCII, or control characters at the ends of the lines.
+        min_share: Smallest share of printable characters in text. The other bytes may be damaged characters, letters
+            that are not ASCII, or control characters at the ends of the lines.
     """
     other_bytes = data.translate(None, delete=printable.encode() + b"\x1b")
     return len(other_bytes) <= (1.0 - min_share) * len(data)
@@ -236,19 +236,20 @@ def _is_text(data: bytes, min_share: float = 0.85) -> bool:
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
-    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. The milliseconds of a
-    time whose seconds are in another column are no clock, because they return to 0 every second. A clock in ms that
-    increases by about 1 could also be a counter. Its name, or values that occur twice, show that it is a clock. If the
-    lines already have a column with the name of a counter or of a clock, the function does not search for another one.
+    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. If one column
+    contains the seconds of a time and another column the milliseconds, the milliseconds are no clock, because they
+    return to 0 every second. A clock in ms that increases by about 1 could also be a counter. Such a clock is
+    recognised by its name, or by values that occur twice. If the lines already have a column with the name of a counter
+    or of a clock, the function does not search for another one.
 
-    For values with names in each line, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for
-    its counter and its clock. For the other values, the key `columns` lists the names, which are copied from a header,
-    because a program that starts later does not receive the header. No keys are needed if the board sends no names, no
-    counter and no clock.
+    If each line names its values, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for its
+    counter and its clock. For values without names in the lines, the key `columns` lists the names. These names are
+    copied from a header, because a program that starts later does not receive the header. No keys are needed if the
+    board sends no names, no counter and no clock.
 
     Args:
         layout: Layout of the lines.
-        frames: Frames that the lines contain, with the same number of values.
+        frames: Frames in the lines. All frames have the same number of values.
         frame_rate_Hz: Number of frames per second, Hz.
     """
     names = list(layout.names)
@@ -272,8 +273,8 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
                     keys[meaning] = name
                 break
 
-    # For the values without a name in each line, list the names from a header, and of the counter and the clock. Other
-    # channels are numbered. If no such name is known, the columns need no names.
+    # For the values without a name in each line, list the names from a header, and the names of the counter and the
+    # clock. Other channels are numbered. If none of these names is known, the columns need no names.
     if any(names[column] for column in layout.unnamed):
         channel_numbers = count(1)
         keys["columns"] = [names[column] or f"ch{next(channel_numbers)}" for column in layout.unnamed]
