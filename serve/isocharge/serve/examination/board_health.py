@@ -29,7 +29,8 @@ class ChannelHealth:
 
     Attributes:
         name: Name that the device uses, or the number of the channel, counted from 1.
-        electrode: Electrode to which the channel is assumed to belong; the name of the channel if this is not clear.
+        electrode: Electrode to which the channel is assumed to belong; the name of the channel if the electrode is not
+            clear.
         offset_pC: Mean charge.
         noise_pC: Standard deviation of the charge without drift and hum.
         drift_pC_per_s: Slope of the charge.
@@ -37,7 +38,7 @@ class ChannelHealth:
             is too short to estimate it.
         span_pC: Difference between the largest and the smallest value.
         unusable: Number of values that are not finite, or whose magnitude is larger than any charge of a film.
-        unusable_value: The first of these values as a text, such as "nan"; empty if all values are usable.
+        unusable_value: The first unusable value as a text, such as "nan"; empty if all values are usable.
     """
 
     name: str
@@ -66,7 +67,8 @@ def measure_channel_health(
         rate_Hz: Frames per second, Hz.
 
     Returns:
-        The number of unusable values, and the other results, which are None if the channel has no usable value.
+        The health of the channel. If no value is usable, the result contains only the number of unusable values and the
+        first of them.
     """
     is_usable = np.abs(charge_pC) <= LARGEST  # false for NaN
     unusable_pC = charge_pC[~is_usable]
@@ -95,17 +97,17 @@ def _fit_drift_and_hum(
 ) -> tuple[float, tuple[float | None, float | None], float]:
     """Fit a constant, a slope (the drift) and the hum at each mains frequency to a charge by least squares.
 
-    In a short time, a hum cannot be distinguished from a drift. At a low frame rate, it cannot be sampled. The hum is
-    then left out.
+    In a short time, a hum cannot be distinguished from a drift. At a low frame rate, a hum cannot be sampled. In both
+    cases, the hum is left out.
 
     Args:
         charge_pC: Charge, shape (n,), pC.
         times_s: Times since the first frame, shape (n,), s.
         rate_Hz: Frames per second, Hz.
-        min_samples_per_period: Smallest frame rate at which a hum is estimated. The default is 10 % above the Nyquist
-            rate.
-        min_hum_time_s: Shortest time from which hum is estimated, s. The resolution of the default is 2 Hz, which
-            separates 50 from 60 Hz.
+        min_samples_per_period: Smallest number of frames per period of a hum for which the hum is estimated. The
+            default is 10 % above the Nyquist rate.
+        min_hum_time_s: Shortest time of measurement for which a hum is estimated, s. The default gives a resolution of
+            2 Hz, which separates 50 Hz from 60 Hz.
 
     Returns:
         The slope, pC/s; the amplitudes of the hum at 50 and at 60 Hz, pC, each None if it is left out; and the standard
@@ -127,7 +129,7 @@ LIVE_TIME_s = 0.5
 """Shortest time in which the frames of a board arrive, s. Frames from a file arrive within a shorter time."""
 
 CLEAN_SHARE = 0.99
-"""Smallest share of bytes in good frames with a good cable and the right baud rate, dimensionless."""
+"""Smallest share of bytes that belong to good frames if the cable and the baud rate are right, dimensionless."""
 
 
 def transmission_sentences(capture: Capture) -> Iterator[str]:
@@ -192,11 +194,11 @@ def channel_count_sentences(
 
     The sentence names a channel of the device file that the board does not send, or states that the board sends more or
     fewer channels than the model has electrodes. If the names of the channels are nearly those of the electrodes, the
-    sentence names the difference. The channels are not compared with the model if there is none, or if the device file
-    assigns a channel to every electrode.
+    sentence names the difference. The channels are not compared with the model if there is no model, or if the device
+    file assigns a channel to every electrode.
 
-    The channels are searched for as in a stream, by two methods of `Channels`. Their results are not used, but if they
-    raise an error, the message of the error is the sentence.
+    The function searches for the channels in the same way as a stream, with two methods of `Channels`. If one of the
+    methods raises an error, the message of the error is the sentence. The results of the methods are not used.
 
     Args:
         capture: The frames, at least one.
@@ -293,15 +295,15 @@ def channel_sentences(
 
 
 def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress) -> Iterator[str]:
-    """Yield one sentence for each setting or property that is missing for the force of a press that is held.
+    """Yield one sentence for each missing setting or property without which the force of a held press seems to change.
 
     The charge amplifiers leak: the charge of a held press decays with a time constant, which the section `[leak]` of
     the device file states. The program corrects the leak with the times of the frames. Two things may be missing:
 
     - A device clock. If the leak is corrected, each frame should contain the time of a clock of the device.
-    - The time constants. They are requested if the device file contains no leak and no press was held during the
-      check. If a press was held, its description already states the time constants. A board that sends currents instead
-      of charges needs no time constants.
+    - The time constants. The user is asked for them if the device file contains no leak and no press was held during
+      the check. If a press was held, its description already states the time constants. A board that sends currents
+      instead of charges needs no time constants.
 
     Args:
         capture: The frames, at least one.

@@ -31,7 +31,7 @@ class ElectrodeCheck:
 
     Attributes:
         expected: Assumed channel of each electrode, by the name of the electrode.
-        found: Channel of each electrode that the presses show, by the name of the electrode.
+        found: Channel of each electrode according to the presses, by the name of the electrode.
         inverted: Channels whose charge falls under a press.
     """
 
@@ -73,7 +73,8 @@ def check_electrodes(
         channels: Assumed channel of each electrode, by the name of the electrode.
         ask: Function that is called with a sentence that asks the user to wait or to press.
         unit: Unit of the charges: "pC", "counts" or another unit.
-        rest_span: Largest minus smallest charge of a channel at rest. The film is touched if the charges vary more.
+        rest_span: Largest minus smallest charge of a channel at rest. If the charges vary more, the film is considered
+            touched.
         timeout_s: Time to wait for each press, s.
 
     Returns:
@@ -105,8 +106,8 @@ def assign_channels(changes: Array, electrodes: Sequence[str], min_advantage: fl
     Args:
         changes: Change of each channel under the press near each electrode, shape (electrodes, channels), any unit.
         electrodes: Names of the electrodes.
-        min_advantage: Smallest ratio of the largest normalised change under a press to the change of any other
-            channel.
+        min_advantage: Smallest ratio of the largest normalised change under a press to the normalised change of any
+            other channel.
 
     Returns:
         Column of the channel for each electrode.
@@ -172,7 +173,7 @@ def _charge_frames(
 
     Args:
         port: The open port.
-        device: Settings of the board, of which the frames, the kind of the front end and the gain are used.
+        device: Settings of the board. Only the frames, the kind of front end and the gain are used.
         channels: Channel of each electrode, by the name of the electrode.
         unit: Unit of the charges. The default threshold of a touch is for pC and counts. In another unit, the threshold
             depends only on the noise.
@@ -204,7 +205,7 @@ def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[st
         Mean touch charges of the press, shape (n_electrode,), in the unit of the board.
 
     Raises:
-        PressCheckError: If the begin or the end of the press does not come in time.
+        PressCheckError: If the press does not begin or does not end in time.
     """
     deadline_s = time.monotonic() + timeout_s
     charges: list[Array] = []

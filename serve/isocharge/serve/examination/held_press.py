@@ -1,12 +1,12 @@
 """Search for a press that is held during the port check, and for the reason why its charge changes.
 
-At the beginning of the press, the levels of the channels change in some direction. The charge of the press is the
-component of the levels in this direction, minus its mean before the press. The charge shows whether an amplifier leaks
-or the film creeps. A leak removes the same share of the charge in every second. The logarithm of the charge Q is then a
-linear function of the time t since the touch, ln Q = a - t / tau. Creep removes the same share of the charge in every
-decade of time. The logarithm of the charge Q is then a linear function of ln t, ln Q = a + b ln t. The functions of a
-leak and of creep are fitted to the charges of a press. A cause is only stated if the other function has a much larger
-sum of squared residuals.
+The levels of all channels form a vector, which changes in some direction at the beginning of the press. The charge of
+the press is the component of the vector in this direction, minus the mean of this component before the press. The
+charge shows whether an amplifier leaks or the film creeps. A leak removes the same share of the charge in every second.
+The logarithm of the charge Q is then a linear function of the time t since the touch, ln Q = a - t / tau. Creep removes
+the same share of the charge in every decade of time. The logarithm of the charge Q is then a linear function of ln t,
+ln Q = a + b ln t. The functions of a leak and of creep are fitted to the charges of a press. The program states one of
+these causes only if the function of the other cause has a much larger sum of squared residuals.
 
 The section `[leak]` of a device file corrects a leak. Creep is not corrected. If the section `[leak]` is used for a
 film that creeps, the error of the charges increases with time.
@@ -21,7 +21,7 @@ from isocharge.common.arrays import Array, Reals
 from isocharge.serve.examination.press_detector import CHANGE_BLOCKS, touched_blocks
 
 MIN_HELD_S = 4.0
-"""Shortest time for which the press must be held afterwards, s."""
+"""Shortest time for which the press must be held after its force has become constant, s."""
 
 STEADY_SHARE = 0.02
 """Largest relative change of the charge of a steady press, dimensionless."""
@@ -32,7 +32,8 @@ class HeldPress(NamedTuple):
 
     Attributes:
         rest_end_s: Time at which the rest before the press ends, s since the first frame.
-        tau_s: Time constant of the leak that explains the decrease of the charge, s; None if it is not a leak.
+        tau_s: Time constant of the leak that explains the decrease of the charge, s; None if no leak explains the
+            decrease.
         description: Sentence that describes whether and how the charge of the press changes.
     """
 
@@ -89,7 +90,7 @@ def _describe(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[f
         drift_per_s: Slope of the level before the press, relative to the charge at the beginning, 1/s.
 
     Returns:
-        The time constant of the leak, s, or None if the charge does not leak, and a sentence.
+        Two values: the time constant of the leak, s, or None if the charge does not leak; and a sentence for the user.
     """
     if abs(drift_per_s) * MIN_HELD_S > STEADY_SHARE:  # the drift would be mistaken for a change of the charge
         percent_per_s = 100.0 * drift_per_s
@@ -111,14 +112,15 @@ def _cause_of_change(held_s: Reals, charge: Reals, min_residual_ratio: float = 9
     Args:
         held_s: Times since the beginning of the press, shape (n,), s.
         charge: Positive charge of the press at these times, shape (n,), in any unit.
-        min_residual_ratio: Smallest ratio of the sums of the squared residuals of two laws for which the better law is
-            reported. With a smaller ratio, variations in the force of a hand could decide which law is reported.
+        min_residual_ratio: The better of two laws is reported only if the sum of squared residuals of the other law is
+            larger by at least this factor. With a smaller factor, variations in the force of a hand could decide which
+            law is reported.
 
     Returns:
-        The time constant of the leak with two significant digits, s, or None if the cause is not a leak, and the cause
-        with advice to the user, as a part of a sentence.
+        Two values: the time constant of the leak with two significant digits, s, or None if the cause is not a leak;
+        and a part of a sentence that states the cause and advises the user.
     """
-    # The charge of a leak decays exponentially with the time, and that of creep as a power of the time.
+    # A leak makes the charge decay exponentially with time. Creep makes the charge decay as a power of time.
     leak_slope_per_s, leak_residual = _fit_line(held_s, np.log(charge))
     creep_slope, creep_residual = _fit_line(np.log(held_s), np.log(charge))
     if leak_slope_per_s < 0.0 and creep_residual > min_residual_ratio * leak_residual:

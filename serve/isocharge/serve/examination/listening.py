@@ -150,8 +150,8 @@ class Capture:
     Attributes:
         received: The bytes of the frames.
         parser: The parser, with its counters.
-        frames: Good frames with one channel or more. Their times are those of the clock of the device if the frames
-            contain a time.
+        frames: Good frames with one channel or more. If the frames contain a time, their times are those of the clock
+            of the device.
     """
 
     received: ReceivedData
@@ -160,7 +160,7 @@ class Capture:
 
     @property
     def intact_share(self) -> float:
-        """Share of the received bytes that were part of a good frame, dimensionless. It is 0 without frames."""
+        """Share of the received bytes that were part of a good frame, dimensionless. The share is 0 without frames."""
         if not self.frames:
             return 0.0
         return 1.0 - self.parser.counts.bytes_dropped / self.received.bytes_seen
@@ -169,7 +169,8 @@ class Capture:
     def rate_Hz(self) -> float:
         """Frame rate in the second half of the frames, Hz; 0 if the times of these frames do not increase.
 
-        The times of the first frames are only assumed if the frames contain no time.
+        The first half is left out, because the times of the first frames are mere assumptions if the frames contain no
+        time.
         """
         later_times_s = elapsed_times(self.frames)[len(self.frames) // 2 :]
         span_s = float(np.ptp(later_times_s)) if self.frames else 0.0

@@ -48,16 +48,17 @@ class Examination:
         lost: Number of lost frames according to the frame numbers; None if frames have no numbers.
         repeated: Number of repeated frames according to the frame numbers; None if frames have no numbers.
         device_clock: Whether the frames contain the time of a clock of the device.
-        unit: Unit of the channels: "pC", or "counts", "V" or a unit in their names, such as "nC", if the charge of one
-            unit is not known.
+        unit: Unit of the channels. The unit is "pC" if the charge of one unit is known. Otherwise, it is the unit that
+            the channels seem to have: "pC", "counts", "V", or a unit in their names, such as "nC".
         channels: Health of each channel that is used; empty without frames.
         unused: Channels that no electrode uses.
         held: Sentence about a press that was held during the check; empty if there was none.
         touch: Sentence about a touch while the film should be at rest; empty if there was none.
         missing: One sentence for each setting or property that is missing before contacts can be computed.
         missing_for_held_presses: One sentence for each setting or property without which the force of a held press
-            seems to change. Touches are computed without them.
-        device: Content of the given device file, or of a proposed device file. It is empty without frames.
+            seems to change. Contacts can be computed without these settings.
+        device: Content of the given device file, or of a proposed device file. A proposed device file is empty if no
+            frames were received.
     """
 
     url: str
@@ -234,16 +235,18 @@ def examine_received(
 
 
 def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[str, ...]) -> dict[int, str]:
-    """Return the name of each electrode, by the position of its channel in the frame.
+    """Return a dictionary from the position of each channel in the frame to the name of its electrode.
 
     The section `[channels]` of the device file states the channel of each electrode. Electrodes whose channel is
-    missing in the frames are left out. Without this section, the channels are assigned by name or by order, as in a
-    stream. If this is not possible, each channel counts as an electrode with the name of the channel.
+    missing in the frames are left out. Without the section `[channels]`, the channels are assigned by name or by order,
+    as in a stream. If this assignment is not possible, each channel counts as an electrode with the name of the
+    channel.
 
     Args:
         capture: The frames, at least one.
         device: Settings of the board. `channels` contains the name of the channel of each electrode.
-        electrodes: Electrodes of the model. If it is empty, the electrodes are those for which `[gain]` states numbers.
+        electrodes: Electrodes of the model. Without a model, the electrodes are those for which `[gain]` states
+            numbers.
     """
     last_frame = capture.frames[-1]
     if device.channels:

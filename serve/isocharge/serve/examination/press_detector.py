@@ -25,7 +25,7 @@ BLOCK_S = 0.1
 """Length of a block, s. A block contains a whole number of mains periods at 50 and at 60 Hz."""
 
 CHANGE_BLOCKS = 5
-"""Number of blocks, which last half a second in total, within which a touch changes the values."""
+"""Number of blocks within which a touch changes the values. Together, these blocks last half a second."""
 
 
 def touched_blocks(values: Array, times_s: Array, min_noise: float = 0.0) -> tuple[Reals, Array, Booleans]:
@@ -60,8 +60,8 @@ def _detect_touches(levels: Array, noise: Array) -> Booleans:
     """Return whether something touches the film in each block, shape (blocks,).
 
     The stage `Touch` of a stream detects the touches. The charges of this stage are the differences between the levels
-    and the rest levels. Before a touch, the rest levels are those `CHANGE_BLOCKS` earlier, so that a slow change is no
-    touch. During a touch, the rest levels remain the same.
+    and the rest levels. Before a touch, the rest levels are the levels `CHANGE_BLOCKS` blocks earlier, so that a slow
+    change does not count as a touch. During a touch, the rest levels remain the same.
 
     Args:
         levels: Levels of the channels, shape (blocks, channels), in any unit.
@@ -84,8 +84,8 @@ def _detect_touches(levels: Array, noise: Array) -> Booleans:
 def touch_sentence(names: Sequence[str], values: Array, times_s: Array, unit: str, min_noise_pC: float = 1.0) -> str:
     """Return a sentence about a touch of a film that should be at rest; empty if the film is not touched.
 
-    If the values are not in pC, the smallest change of a touch is derived from the noise only. If the time is too
-    short, no touch is found.
+    If the values are not in pC, the smallest change that counts as a touch is derived from the noise only. If the time
+    is too short, no touch is found.
 
     Args:
         names: Names of the channels.
@@ -117,7 +117,7 @@ def block_medians(values: Array, times_s: Array) -> Array:
 
     Returns:
         Medians of the finite values, shape (blocks, channels). Blocks without frames are left out, and so is the last
-        block, which may be incomplete. NaN if a block of a channel has no finite value.
+        block, which may be incomplete. A median is NaN if the channel has no finite value in the block.
     """
     block_numbers = np.floor(times_s / BLOCK_S + 1e-6)  # a rounding error must not move a frame
     first_rows = np.flatnonzero(np.diff(block_numbers)) + 1  # first frame of each block except the first block

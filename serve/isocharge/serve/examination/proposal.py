@@ -23,7 +23,7 @@ ELECTRODES = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 
 
 def recognised_frames(received: ReceivedData) -> dict[str, Any]:
-    """Return the section `[frames]` of a device file that describes the received bytes; empty if it is unknown."""
+    """Return the section `[frames]` that describes the received bytes in a device file; empty for an unknown format."""
     frames = recognise(received.data, received.span_s, are_datagrams=received.are_datagrams)
     if frames is None:
         return {}
@@ -121,7 +121,8 @@ def _choose_channels(
         min_noise_share: Smallest noise of a channel that is connected to an electrode, relative to the median noise.
 
     Returns:
-        Position of the channel in the frame by the name of the electrode; empty if there are too few channels.
+        For each electrode, by its name: the position of its channel in the frame. The result is empty if there are too
+        few channels.
     """
     # Find the channels that may belong to electrodes, the candidates. A channel is left out if its values vary much
     # less than the others, or are mostly not finite. If no channel varies, all channels are candidates.
@@ -156,6 +157,6 @@ def _choose_channels(
 
 
 def _rest_level(values: Array) -> float:
-    """Return the median of the finite values of a channel with six digits. It is 0 without finite values."""
+    """Return the median of the finite values of a channel, rounded to six digits, or 0 without finite values."""
     finite_values = values[np.isfinite(values)]
     return float(f"{np.median(finite_values):.6g}") if len(finite_values) else 0.0
