@@ -70,7 +70,7 @@ def check_bytes(name: str, head: bytes) -> None:
 
 
 def foreign_kind(name: str, head: bytes) -> str:
-    """Return the kind of a file that is no recording and does not come from a board, with advice; empty for others.
+    """Return the kind of a file that is not from a board, with advice; empty for recordings and bytes of a board.
 
     The text continues a sentence that states what was expected, as in "got an MCAP file; ...".
 
@@ -109,7 +109,7 @@ class FileSource:
         name: Path of the file, or - for the standard input.
 
     Attributes:
-        is_live: Always False, because no bytes are lost if they are read later.
+        is_live: Always False, because no bytes are lost if the program reads them later.
         is_on_disk: Whether the bytes come from a file on a disk, which does not state when they arrived.
     """
 
@@ -118,8 +118,7 @@ class FileSource:
     def __init__(self, descriptor: int, name: str) -> None:
         """Store the file descriptor and the name, and check the first bytes of a file on a disk.
 
-        The first bytes of a pipe cannot be read twice. The first bytes of a pipe are checked when the first chunk is
-        read.
+        The first bytes of a pipe cannot be read twice, so they are checked only when the first chunk is read.
 
         Raises:
             InputError: If the file on the disk does not come from a board.

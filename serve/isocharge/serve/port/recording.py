@@ -75,7 +75,7 @@ class Recorder:
             path: File to which the recording is written. It must not exist.
             model: Label of the model, `name/version`.
             device: Content of the device file.
-            name: Name of the film in the records; None for the name of the sensor of the model.
+            name: Name of the film in the records; None to use the name of the sensor that the model states.
 
         Raises:
             RecordingError: If a reader would refuse the first line of the recording, for example because of the name.
@@ -108,14 +108,14 @@ class Recorder:
     def event(self, **event: bool | str | Marker | Chunk) -> None:
         """Write an event: `chunk=chunk`, `marker=marker`, `tare=True` for a new tare, `use=label` for a new model.
 
-        The records of a chunk are written after it, with `write`.
+        The records of a chunk are written after the chunk, with the method `write`.
         """
         self.write(encode(event).decode())
 
     def write(self, lines: str) -> None:
         """Append complete lines to the file.
 
-        If an interrupted call has left an incomplete line, the new lines are written over it. If the disk is full, an
+        If an interrupted call has left an incomplete line, the new lines overwrite this line. If the disk is full, an
         error is logged, and all later calls write nothing.
 
         Args:
@@ -157,7 +157,7 @@ class Recording:
     Attributes:
         model: Label of the model, `name/version`, at the beginning of the recording.
         device: Content of the device file.
-        name: Name of the film in the records; empty for the name of the sensor of the model.
+        name: Name of the film in the records; empty to use the name of the sensor that the model states.
     """
 
     def __init__(self, path: StrPath) -> None:
@@ -213,7 +213,7 @@ class Recording:
     def _parsed_lines(self, line_type: type[Line], beginning: str = "") -> Iterator[Line]:
         """Parse the lines after the first line, and yield their content.
 
-        An incomplete last line is ignored, because writing it was interrupted.
+        An incomplete last line is ignored, because the program that wrote the line was interrupted.
 
         Args:
             line_type: Struct type to which each line is converted.

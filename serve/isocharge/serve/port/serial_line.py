@@ -3,11 +3,12 @@
 A connection is called a line. A line is either a serial port, which pyserial opens, or a UDP socket. If the system has
 file descriptors for serial ports, each read from a serial port needs only three system calls.
 
-If the program did not read a line for some time, many bytes wait. All of them are received at once, at least up to
-`MAX_READ_BYTES`, so that the time in which they arrived is divided among all their frames. Only datagrams of binary
-frames are received one by one, because the beginning of a datagram is the beginning of a frame.
+If the program has not read a line for some time, many bytes are waiting. All waiting bytes, at least up to
+`MAX_READ_BYTES`, are received at once. The time in which these bytes arrived is therefore divided among all frames in
+them. Only datagrams of binary frames are received one by one, because the beginning of a datagram is the beginning of a
+frame.
 
-Some boards send a text without a line feed at the end in each datagram. A line feed is added to each datagram of such a
+Some boards send datagrams of text that do not end with a line feed. A line feed is added to each datagram of such a
 board, because text parsers need the line feed. If a datagram of the board has ended with a line feed, nothing is added
 to later datagrams.
 
@@ -53,7 +54,7 @@ class Request:
 
 
 MAX_READ_BYTES = 65536
-"""Largest number of bytes of one read. No more bytes are added to received bytes that have reached this size.
+"""Largest number of bytes of one read. Once the received bytes have reached this size, no more bytes are added.
 
 No datagram is larger.
 """
@@ -128,7 +129,8 @@ class SerialLine:
 
         Raises:
             BlockingIOError: If bytes arrived, but another program has read them.
-            READ_ERRORS: If the line disappears. If bytes have arrived before, the next call raises the error.
+            READ_ERRORS: If the line disappears. If bytes had arrived before, these bytes are returned, and the next
+                call raises the error.
         """
         if self._descriptor is None:
             return self._receive_by_pyserial(timeout_s)
@@ -172,7 +174,7 @@ class Requester:
     """Line to a board that sends a frame only on request. The line sends the requests, and removes their echoes."""
 
     def __init__(self, line: SerialLine, request: Request) -> None:
-        """Make the first request due at once.
+        """Store the line and the request. The first request is due at once.
 
         Args:
             line: The open line to the board.
@@ -215,8 +217,8 @@ class Requester:
     def wait_s(self) -> float:
         """Return the time until the next request is due, s, or 0 if a request is due now.
 
-        At least 1 / `rate_Hz` must pass between two requests. After a request without an answer, also at least
-        `REPEAT_TIME_s` must pass. After the latest byte of an answer, also at least `QUIET_TIME_s` must pass.
+        At least 1 / `rate_Hz` must pass between two requests. If a request receives no answer, `REPEAT_TIME_s` must
+        pass, too. If an answer arrives, `QUIET_TIME_s` must pass after its latest byte.
         """
         return max(0.0, self._due_s - time.monotonic())
 
@@ -277,7 +279,7 @@ class UdpSocket:
 
         Raises:
             OSError: If the address cannot be bound.
-            ValueError: If the URL has no port, or has more than a host and a port.
+            ValueError: If the URL has no port, or contains more than a host and a port.
         """
         parts = urlsplit(url)
         if parts.port is None or parts.path or parts.query:
@@ -296,7 +298,7 @@ class UdpSocket:
         self._senders: list[tuple[Any, ...]] = []  # host and port of the first two senders of datagrams
 
     def receive(self, timeout_s: float) -> bytes:
-        """Wait for a datagram, and return it, or return all datagrams that have arrived if they are text.
+        """Wait for a datagram, and return it. If the datagram is text, return all datagrams that have arrived.
 
         Args:
             timeout_s: Longest time to wait, s.
@@ -344,9 +346,10 @@ class UdpSocket:
     def _with_line_feed(self, data: bytes) -> bytes:
         """Add a line feed to a datagram of text if the board does not end its lines with line feeds.
 
-        A board ends its lines itself if a datagram ends with a line feed. Because a serial bridge may divide a line
-        over several datagrams, the next datagrams need not contain a line feed. After more than `MAX_LINE_DATAGRAMS`
-        datagrams without one, the board no longer ends its lines. A datagram that is no text is returned unchanged.
+        If a datagram ends with a line feed, the board is assumed to end its lines itself. Because a serial bridge may
+        divide a line over several datagrams, the next datagrams need not contain a line feed. After more than
+        `MAX_LINE_DATAGRAMS` datagrams without a line feed, the board is assumed not to end its lines any more. A
+        datagram that is no text is returned unchanged.
 
         Args:
             data: The datagram.

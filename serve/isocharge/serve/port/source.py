@@ -8,9 +8,9 @@ A port is a device path or a URL that pyserial accepts, such as `/dev/ttyACM0`, 
 `udp://host:port` receives datagrams.
 
 Other packages can add sources. A package that adds a source must declare an entry point in the group
-"isocharge.sources", whose name is the scheme of its URLs. The entry point must refer to a function that accepts a URL
-and returns a context manager of a `Source`. A line of a recording can contain a chunk of up to 700 kB. For example,
-this entry point in pyproject.toml adds URLs such as `can://vcan0`:
+"isocharge.sources". The name of the entry point is the scheme of the URLs of this source. The entry point must refer to
+a function that accepts a URL and returns a context manager of a `Source`. A line of a recording can contain a chunk of
+up to 700 kB. For example, this entry point in pyproject.toml adds URLs such as `can://vcan0`:
 
     [project.entry-points."isocharge.sources"]
     can = "my_package:open_bus"
@@ -46,7 +46,7 @@ from isocharge.serve.port.serial_line import (
 )
 
 RETRY_PAUSE_s = 0.3
-"""Pause before a port that cannot be opened or was lost is opened again, s."""
+"""Pause before another attempt to open a port that could not be opened or was lost, s."""
 
 START_UP_s = 10.0
 """Time for which a board may be silent after its port was opened, s.
@@ -68,13 +68,12 @@ class Port:
         silence_s: Time without a byte after which the port is considered lost, s.
         reconnect: Whether to open a lost port repeatedly until it is back, instead of raising an error.
         request: Request that the board needs for each frame; None for a board that sends frames by itself.
-        wait: Time to wait until the port can be opened, s. The port may also take this time to send its first byte, but
-            at least `silence_s` and `START_UP_s`.
+        wait: Time to wait until the port can be opened, s. The longest wait for the first byte is the largest of this
+            time, `silence_s` and `START_UP_s`.
 
     Attributes:
         start_up_s: Longest wait for the first byte after the port was opened, s.
-        is_live: Always True, because the bytes arrive whether or not the program reads them, and are lost if the
-            program does not read them.
+        is_live: Always True, because bytes that the program does not read in time are lost.
 
     Example:
         >>> with Port("/dev/ttyACM0") as port:  # doctest: +SKIP
@@ -181,8 +180,9 @@ class Port:
     def __iter__(self) -> Iterator[Chunk]:
         """Yield chunks as they arrive. If the port is lost and `reconnect` is true, open the port again.
 
-        The port counts as lost if no byte arrives within `start_up_s` after it was opened, or later within `silence_s`.
-        After two chunks of the largest size in succession, a warning is logged once, because bytes wait to be read.
+        The port counts as lost if it sends no byte within `start_up_s` after it was opened, or if it later sends no
+        byte for `silence_s`. After two successive chunks of the largest size, a warning is logged once, because many
+        bytes are waiting to be read.
 
         Raises:
             PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
@@ -246,8 +246,8 @@ class Port:
     def _read_after_reconnecting(self) -> Chunk:
         """Open the port repeatedly until bytes arrive, and return the first chunk.
 
-        Opening a port restarts many boards. The pause before the next attempt is therefore doubled each time that an
-        opened port sends nothing, up to `start_up_s`.
+        Opening a port restarts many boards. Each time that an opened port sends nothing, the pause before the next
+        attempt is therefore doubled, up to `start_up_s`.
         """
         pause_s = RETRY_PAUSE_s
         chunk: Chunk | None = None
@@ -284,7 +284,7 @@ class Source(Protocol):
 
 
 class AddedSource(contextlib.ExitStack):
-    """Source of another package, whose errors name the entry point of the package.
+    """Source that another package provides. Its error messages state the entry point of the package.
 
     Each chunk is checked, so that a recording never contains a chunk that a replay would refuse.
 
@@ -296,7 +296,7 @@ class AddedSource(contextlib.ExitStack):
         """Open the source, which is closed when the context is left.
 
         Args:
-            entry_point: Entry point that refers to a function, which returns the source for a URL.
+            entry_point: Entry point that refers to a function. The function returns the source for a URL.
             url: The URL.
 
         Raises:
@@ -322,7 +322,8 @@ class AddedSource(contextlib.ExitStack):
 def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> contextlib.AbstractContextManager[Source]:
     """Return a context manager that opens a port, a file or the standard input as a source of chunks.
 
-    The function waits until the path exists. The port or the file is opened when the context is entered.
+    The function waits until the path exists, but not longer than `wait`. The port or the file is opened when the
+    context is entered.
 
     Args:
         url: Device path or URL of a port, path of a file or of a named pipe, or - for the standard input.
