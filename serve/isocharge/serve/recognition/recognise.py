@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from msgspec import structs, to_builtins
 
-from isocharge.common.arrays import Booleans
+from isocharge.common.arrays import Array, Booleans
 from isocharge.serve.frames.formats import AutoParser
 from isocharge.serve.frames.frame import SEQ, TIMES_US, Frame
 from isocharge.serve.frames.frame_layout import PADDING, SYNC, Field, FrameLayout
@@ -236,12 +236,6 @@ def _is_text(data: bytes, min_share: float = 0.85) -> bool:
 def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) -> dict[str, Any]:
     """Return the keys that describe the counter, the clock and the columns of lines of text in a device file.
 
-    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. If one column
-    contains the seconds of a time and another column the milliseconds, the milliseconds are no clock, because they
-    return to 0 every second. A clock in ms that increases by about 1 could also be a counter. Such a clock is
-    recognised by its name, or by values that occur twice. If the lines already have a column with the name of a counter
-    or of a clock, the function does not search for another one.
-
     If each line names its values, the keys `seq`, `t_us`, `t_ms` and `t_s` state the names that the board uses for its
     counter and its clock. For values without names in the lines, the key `columns` lists the names. These names are
     copied from a header, because a program that starts later does not receive the header. No keys are needed if the
@@ -257,21 +251,11 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
     for (column, _scale), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
         name = names[column]
-        meanings = list(possible_meanings(channel_steps, frame_rate_Hz))  # the counter comes before a clock
-        if any(word in name.lower() for word in ("ms", "milli", "time")):
-            meanings = meanings[-1:]  # do not take the column for a counter if it may be a clock
-        for meaning, tick in meanings:
-            is_possible = SEQ not in names
-            if meaning != SEQ:
-                # The ticks must be those of the name, because a device file for lines of text cannot state their
-                # duration. The milliseconds of a time wrap every second, but a clock wraps at most once.
-                has_no_clock = TIMES_US.keys().isdisjoint(names)
-                is_possible = has_no_clock and tick == 1.0 and count_wraps(channel_steps) < 2
-            if is_possible:
-                names[column] = meaning
-                if column not in layout.unnamed:  # the board sends a name with each value
-                    keys[meaning] = name
-                break
+        meaning = _counter_or_clock(name, channel_steps, frame_rate_Hz, names)
+        if meaning:
+            names[column] = meaning
+            if column not in layout.unnamed:  # the board sends a name with each value
+                keys[meaning] = name
 
     # For the values without a name in each line, list the names from a header, and the names of the counter and the
     # clock. Other channels are numbered. If none of these names is known, the columns need no names.
@@ -279,3 +263,32 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
         channel_numbers = count(1)
         keys["columns"] = [names[column] or f"ch{next(channel_numbers)}" for column in layout.unnamed]
     return keys
+
+
+def _counter_or_clock(name: str, steps: Array, frame_rate_Hz: float, known_names: Sequence[str]) -> str:
+    """Return `seq` if a column contains the frame counter, `t_us`, `t_ms` or `t_s` for a clock, otherwise "".
+
+    A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. If one column
+    contains the seconds of a time and another column the milliseconds, the milliseconds are no clock, because they
+    return to 0 every second. A clock in ms that increases by about 1 could also be a counter. Such a clock is
+    recognised by its name, or by values that occur twice.
+
+    Args:
+        name: Name of the column; empty if the board sends no name.
+        steps: Differences of the values of consecutive frames, shape (n,).
+        frame_rate_Hz: Number of frames per second, Hz.
+        known_names: Names of all columns. If they contain a counter or a clock, the column is not a second one.
+    """
+    meanings = list(possible_meanings(steps, frame_rate_Hz))  # the counter comes before a clock
+    if any(word in name.lower() for word in ("ms", "milli", "time")):
+        meanings = meanings[-1:]  # do not take the column for a counter if it may be a clock
+    has_counter = SEQ in known_names
+    has_clock = not TIMES_US.keys().isdisjoint(known_names)
+    for meaning, tick in meanings:
+        if meaning == SEQ and not has_counter:
+            return meaning
+        # The ticks of a clock must be those of the name, because a device file for lines of text cannot state their
+        # duration. The milliseconds of a time wrap every second, but a clock wraps at most once.
+        if meaning != SEQ and not has_clock and tick == 1.0 and count_wraps(steps) < 2:
+            return meaning
+    return ""
