@@ -12,7 +12,7 @@ Components are added in three cases.
 
 - When a touch begins, components are placed all over the film. Components that do not explain the charges are removed.
 - Before each update, a component with an unknown velocity is added, because the contact may have started or stopped.
-- If the most probable component extends across a fold, two components are added at its ends.
+- If the most probable component extends across a fold, one component is added at each of its two ends.
 
 The charges are averaged over intervals of `NOISE_INTERVAL_s` before an update. Shorter intervals would hardly improve
 the accuracy.
@@ -54,7 +54,7 @@ SLOW_NOISE_STD = 0.003
 """Standard deviation of slow noise, relative to the charge. Slow noise lasts for several frames."""
 
 SEARCH_INTERVAL_s = 0.05
-"""Pause of the searches over the whole film after an unsuccessful search, s. Each search takes milliseconds."""
+"""Time between an unsuccessful search of the whole film and the next search, s. Each search takes milliseconds."""
 
 MAX_RELATIVE_RADIUS = 1.1
 """Distance from the centre, relative to the radius of the film, beyond which components are removed."""
@@ -62,9 +62,9 @@ MAX_RELATIVE_RADIUS = 1.1
 CLEAR_DISTANCE = 4.0
 """Distance, in standard deviations, above which two positions are clearly different.
 
-Components that are further apart are different contacts. If a fold is nearer to the most probable component, two
-components are added. The distance is large, because an error of a gain displaces the fold. The contact then seems to
-stop before the fold.
+Components that are further apart describe different contacts. If a fold is nearer than this distance to the most
+probable component, two components are added. The distance is large, because an error of an electrode gain displaces the
+fold. A contact that crosses the fold then seems to stop before the fold.
 """
 
 SPLIT_DISTANCE = 2.5
@@ -89,16 +89,17 @@ class ContactHypothesis(NamedTuple):
     probability: float
 
     def values_after(self, dt_s: float) -> tuple[float, float, float]:
-        """Return x (mm), y (mm) and the force (N) a time `dt_s` later, if the rates stay constant."""
+        """Return x (mm), y (mm) and the force (N) after the time `dt_s`, assuming that the rates stay constant."""
         x_mm, y_mm, log_force = (self.mean[VALUES] + dt_s * self.mean[RATES]).tolist()
         return x_mm, y_mm, math.exp(log_force)
 
     def contact_after(self, dt_s: float, misfit: float) -> Contact:
-        """Return the contact a time `dt_s` later. The time is so short that the covariance is taken as constant.
+        """Return the contact after the time `dt_s`. The covariance is taken as constant, because the time is short.
 
         Args:
             dt_s: The time, s.
-            misfit: Distance of the measured charges from those of the contact, in standard deviations of the noise.
+            misfit: Distance of the measured charges from the charges of the contact, in standard deviations of the
+                noise.
         """
         x_mm, y_mm, force_N = self.values_after(dt_s)
         covariance = self.covariance[VALUES, VALUES]  # of x, y and ln F
@@ -135,7 +136,7 @@ class ContactMixture:
         Args:
             charges: Charges of every contact on the film.
             noise: Noise of the charges of a frame.
-            validity: Domain of the contacts that the model can answer.
+            validity: Domain in which the contacts of the model are valid.
         """
         self._charges = charges
         self._noise = noise
@@ -178,9 +179,10 @@ class ContactMixture:
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
         """Process the charges of a frame, and return the contacts that explain the charges of the latest update.
 
-        The frames within `NOISE_INTERVAL_s` are one step, because their noise is partly the same. The mixture is
-        updated at the end of each step, with the mean charges of its frames. The components of the mixture
-        (`_components`) are Gaussian distributions of the contact; None if no contact explains the charges.
+        Frames within `NOISE_INTERVAL_s` form one step, because a part of their noise is the same. The mixture is
+        updated at the end of each step, with the mean charges of the frames in the step. The components of the mixture
+        (`_components`) are Gaussian distributions of the contact. If no contact explains the charges, `_components` is
+        None.
 
         Args:
             charge_pC: Touch charges, shape (n_electrode,), pC.
@@ -251,10 +253,11 @@ class ContactMixture:
         """Update components with charges, and store the result if a component explains the charges.
 
         The result consists of the components (`_components`), the contacts that they represent (`_hypotheses`), and the
-        misfit of the most probable component (`_misfit`). Otherwise, these attributes remain unchanged.
+        misfit of the most probable component (`_misfit`). If no component explains the charges, these attributes remain
+        unchanged.
 
         Args:
-            prior: Predicted components. Those that are updated to states beyond `MAX_RELATIVE_RADIUS` are removed.
+            prior: Predicted components. A component is removed if its updated state lies beyond `MAX_RELATIVE_RADIUS`.
             charge_pC: Mean charges of this step, shape (n_electrode,), pC.
             variance_pC2: Variances of the charges, shape (n_electrode,), pC^2.
             iterations: Number of iterations of the Kalman filter.
@@ -271,8 +274,8 @@ class ContactMixture:
         self._misfit = math.sqrt(updated.squared_misfit[best])
         components = prune_components(components)  # the most probable component is now the first one
 
-        # Search for folds between the components, and between the most probable component and two states that lie at
-        # the distance `CLEAR_DISTANCE` on both sides of it on its longest axis.
+        # Search for folds between the components. Also search for folds between the most probable component and two
+        # distant states. These states lie on its longest axis, at the distance `CLEAR_DISTANCE` on either side.
         axis = _longest_axis(components.covariance[0])
         distant_states = components.mean[0] + CLEAR_DISTANCE * np.array([axis, -axis])
         is_across_fold = self._is_across_fold(np.vstack([distant_states, components.mean]))

@@ -13,19 +13,20 @@ touch therefore updates the estimate of the state. An iterated extended Kalman f
 together with the contact of the touch. The prior distribution of the state is Gaussian: the estimate from the earlier
 touches. The contact has no prior distribution, because nothing is known about it before the touch.
 
-The pretension, the gains and the offset may change between touches. Before each touch, their variances therefore
-increase a little, up to those before the first touch. If a touch disagrees with the estimate, the pretension may have
-changed suddenly, and its variance becomes again that before the first touch. The changes along the uncertain directions
-belong to properties that a film keeps, so their variances only decrease.
+The pretension, the gains and the offset may change between touches. Before each touch, the variances of these unknowns
+therefore increase a little, at most to their values before the first touch. If a touch disagrees with the estimate, the
+pretension may have changed suddenly. The variance of the pretension then returns to its value before the first touch.
+The uncertain directions consist of properties that a film keeps. The variances of the changes along these directions
+therefore only decrease.
 
 The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
 that the same contact would cause on the calibrated film, and the network computes the contact from the converted
 charges. The conversion depends on the contact. The charges are therefore converted twice, the second time for the
 contact that the network computes after the first conversion.
 
-The estimate is considered wrong if no state explains the latest touches, or if the estimated pretension or offset is at
-the end of its range. In this case, the film is called lost. Contacts are corrected with the last estimate that
-explained its touches, until a new estimate explains the latest touches.
+The estimate is considered wrong if no state explains the latest touches, or if the estimated pretension or the
+estimated offset is at an end of its range. In this case, the film is called lost. Until a new estimate explains the
+latest touches, contacts are corrected with the last estimate that explained the touches at its time.
 
 Each touch contributes one set of charges. To reduce the noise of a single reading, this set is the average over the
 frames whose contact is close to the contact with the largest force. A touch is not used if its frames have flags that
@@ -113,7 +114,10 @@ class TouchPeak:
 
 
 RELATIVE_OFFSET_STD = 0.1
-"""Standard deviation of the common offset, and of a touch's deviation from it, relative to the largest offset."""
+"""Standard deviation of the common offset, relative to the largest offset.
+
+The offset of a single touch deviates from the common offset with the same standard deviation.
+"""
 
 SMALLEST_STD = 1e-4
 """Smallest standard deviation of an unknown, in its unit, so that the covariance can be inverted."""
@@ -130,8 +134,9 @@ A squared distance is divided by the number of independent residuals of a touch.
 SUDDEN_MEAN_SQUARE = 6.0
 """Mean squared distance of a touch from the predicted touch, above which the pretension may have changed suddenly.
 
-A squared distance is divided by the number of independent residuals of a touch, and refers to the scaled errors. With a
-larger value, sudden changes are noticed later. With a smaller value, forces on an unchanged film are less accurate.
+A squared distance is divided by the number of independent residuals of a touch. The distance is measured in standard
+deviations of the scaled errors. With a larger value, sudden changes are noticed later. With a smaller value, forces on
+an unchanged film are less accurate.
 """
 
 CLEAR_CHANGE = 3.0
@@ -158,7 +163,7 @@ MEMORY_TOUCHES = 16
 """Number of touches after which the weight of a touch in the mean squared distance has decreased to 1/e."""
 
 SMALLEST_ERROR_SCALE = 0.1
-"""Lower limit of the scale of the error covariance, dimensionless, because touches may agree by chance."""
+"""Lower limit for the scale of the error covariance, dimensionless: a few touches may agree by chance."""
 
 
 class FollowRule(Rule, frozen=True, kw_only=True):
@@ -182,8 +187,8 @@ class _Conversion(NamedTuple):
     Attributes:
         contact: Contact that the model computes from charges before the conversion. The conversion is used for this
             contact and for contacts near it.
-        shift_pC: Charges that are added, shape (n_electrode,), pC.
-        covariance: Covariance of x (mm), y (mm) and the force (N) because of the errors of the state, shape (3, 3).
+        shift_pC: Charges that the conversion adds, shape (n_electrode,), pC.
+        covariance: Covariance of x (mm), y (mm) and the force (N) that the errors of the state cause, shape (3, 3).
     """
 
     contact: Contact
@@ -364,7 +369,7 @@ class FilmFollower(Stage):
     def _error_scale(self) -> float:
         """Scale of the error covariance of touches, dimensionless: the mean squared distance of the latest touches.
 
-        The scale does not exceed 1, so that an unexplained change of the film is not taken for larger errors.
+        The scale does not exceed 1, so that an unexplained change of the film is not mistaken for larger errors.
         """
         return min(max(self._mean_square, SMALLEST_ERROR_SCALE), 1.0)
 
@@ -378,8 +383,8 @@ class FilmFollower(Stage):
         Savage-Dickey ratio (Dickey 1971). This ratio is the probability density of t = 0 after the touches, divided by
         the probability density of t = 0 before the first touch.
 
-        The covariance is not a mean over both cases, but that of the first case, because hardly any film keeps its
-        pretension exactly. The mean state differs from the states of both cases. Therefore, the covariance is
+        The covariance is the covariance of the first case and not a mean over both cases, because hardly any film keeps
+        its pretension exactly. The mean state differs from the states of both cases. Therefore, the covariance is
         increased by the outer product of the difference between these states, times the probability of no change.
         """
         change_MPa = self._state[0]
@@ -430,7 +435,7 @@ class FilmFollower(Stage):
         return np.clip([[contact.x_mm, contact.y_mm, log_force]], *self._contact_bounds)
 
     def follow_contact(self, contact: Contact, charge_pC: Array) -> Contact:
-        """Correct a contact for the estimated changes of the film.
+        """Return a contact after correction for the estimated changes of the film.
 
         The uncertainty of the state is added to the standard deviations of the contact. Before the first estimate of
         the film, the contact is returned unchanged.
@@ -456,7 +461,7 @@ class FilmFollower(Stage):
         return Contact(*values.tolist())
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
-        """Return the conversion of charges of the changed film, near a contact, into charges of the calibrated film.
+        """Return the conversion from charges of the changed film to charges of the calibrated film, near a contact.
 
         Args:
             contact: Contact on the calibrated film.

@@ -1,4 +1,4 @@
-"""Gaussian components of the states of a contact, and their prediction and update by the charges of a frame.
+"""Gaussian components that describe the state of a contact, with their prediction and their update for each frame.
 
 The state of a component consists of x, y and the logarithm of the force, the rates of change of these three values, and
 the logarithms of the electrode gains.
@@ -38,12 +38,12 @@ MAX_ITERATION_STEP = np.array([0.5, 0.5, 0.2])
 INITIAL_RATE_STD = np.array([60.0, 60.0, 10.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s.
 
-The rate of ln F is small, because a wrong contact together with a change of the force may explain the charges. If the
-force changes faster, the film is searched again.
+The standard deviation of the rate of ln F is small. Otherwise, a wrong contact with a changing force could explain the
+charges. If the force changes faster, the film is searched again.
 """
 
 FORCE_ACCELERATION_DENSITY = 2.0
-"""Spectral density of the second derivative of ln F, 1/s^3. It is small for the same reason."""
+"""Spectral density of the second derivative of ln F, 1/s^3. The value is small for the reason stated above."""
 
 
 class Components(NamedTuple):
@@ -60,7 +60,7 @@ class Components(NamedTuple):
     log_weight: Array
 
     def select(self, rows: list[int] | Booleans) -> "Components":
-        """Return copies of the components with the indices `rows`, or of those for which `rows` is true."""
+        """Return copies of the components that `rows` selects, by indices or by a truth value for each component."""
         return Components(self.mean[rows], self.covariance[rows], self.log_weight[rows])
 
     def with_copies_of_first(self, count: int) -> "Components":
@@ -74,8 +74,8 @@ class UpdatedComponents(NamedTuple):
     Attributes:
         components: The components, in the order before the update.
         squared_misfit: Squared misfit of the charges of each component relative to the noise, shape (n,).
-        squared_distance: Sum of the squared misfit and the squared change of the state relative to its covariance
-            before the update, shape (n,).
+        squared_distance: Squared misfit plus squared change of the state, shape (n,). The change is measured relative
+            to the covariance of the state before the update.
     """
 
     components: Components
@@ -191,9 +191,9 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
 
     Args:
         components: Components after an update.
-        max_count: Largest number of components that remain, which are the most probable ones.
-        merge_distance: Difference of each entry of `MOTION` below which two components are merged, in standard
-            deviations of the entry.
+        max_count: Largest number of remaining components. If there are more, only the most probable ones remain.
+        merge_distance: Two components are merged if each entry of `MOTION` differs by less than this number of standard
+            deviations.
 
     Returns:
         The remaining components, the most probable first.
@@ -220,9 +220,9 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
 def split_first_component(components: Components, axis: Array, distance: float) -> Components:
     """Add two narrow components, one at each end of an axis through the first component.
 
-    The weight of an added component is the weight of the first component, multiplied by the density of the first
-    component at this end relative to its maximum. Its variance along the axis is a quarter of that of the first
-    component.
+    The density of the first component at an end is divided by the maximum of this density. The weight of an added
+    component is this ratio times the weight of the first component. The variance of an added component along the axis
+    is a quarter of the variance of the first component.
 
     Args:
         components: The components.

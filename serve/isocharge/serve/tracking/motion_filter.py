@@ -4,7 +4,7 @@ The state of a contact consists of x, y and ln F, and the rates of these three v
 moves, and the force is either held or changes. Each of these four modes has a Kalman filter (Blom and Bar-Shalom 1988).
 Before each frame, the estimates of the modes are mixed, because the mode may have changed. After each frame, the
 innovation of each mode determines its new probability. The velocity of a held position is zero. When a movement begins,
-its velocity is unknown. A white acceleration changes the velocity later.
+its velocity is unknown. Later, a white random acceleration changes the velocity.
 
 The covariance that a model reports applies to the noise with which the model was trained. The actual noise of a board
 may be smaller or larger. The filter estimates the actual noise: noise changes randomly from frame to frame, whereas a
@@ -38,13 +38,13 @@ MOVING_POSITION = slice(2, 4)
 """Slice of the two modes in which the position moves."""
 
 _IS_MOVING = np.tile([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 0.0], [1.0, 1.0, 1.0]], 2)
-"""Whether x, y and ln F change (1) or are held (0) in each of the four modes, and the same for their rates, (4, 6)."""
+"""Whether x, y and ln F change (1) or are held (0) in each mode. The values are repeated for the rates; (4, 6)."""
 
 _CHANGE_COUNT = np.array([[0.0, 1.0, 1.0, 2.0], [1.0, 0.0, 2.0, 1.0], [1.0, 2.0, 0.0, 1.0], [2.0, 1.0, 1.0, 0.0]])
-"""Number of quantities (position and force) that start or stop to change between two modes, 0 to 2, shape (4, 4)."""
+"""Number of quantities (position, force) that start or stop changing between two modes, 0 to 2, shape (4, 4)."""
 
 MEAN_MODE_TIME_s = 0.7
-"""Mean time after which a position or a force that is held starts to change, or the reverse, s."""
+"""Mean time after which a held position or force starts changing, and a changing one stops changing, s."""
 
 INITIAL_RATE_STD = np.array([60.0, 60.0, 100.0])
 """Standard deviations of the rates at the beginning of a movement, mm/s, mm/s and 1/s."""
@@ -61,19 +61,19 @@ _INTEGRATION = np.eye(6, k=3)
 """Matrix that selects the rate of each value of a state."""
 
 HELD_DRIFT_DENSITY = np.diag([5e-4, 5e-4, 5e-4, 0.0, 0.0, 0.0])
-"""Increase of the covariance of a state per second, because held values drift, mm^2/s or 1/s, shape (6, 6).
+"""Increase of the covariance of a state per second due to the drift of held values, mm^2/s or 1/s, shape (6, 6).
 
 A held finger drifts by 0.02 mm in a second.
 """
 
 ACCELERATION_DENSITY = np.array([150.0, 150.0, 1e6] * 2)
-"""Spectral densities of the accelerations of slow x and y, mm^2/s^3, and of the second derivative of ln F, 1/s^3.
+"""Spectral densities of the acceleration of a slow contact, mm^2/s^3, and of the second derivative of ln F, 1/s^3.
 
 The same densities apply to the rates, so the shape is (6,).
 """
 
 SPEED_CHANGE_RATE = np.array([0.5, 0.5, 0.0] * 2)
-"""Increase of these spectral densities with the squared speed, 1/s, shape (6,).
+"""Increase of the spectral densities of the acceleration with the squared speed, 1/s, shape (6,).
 
 A fast contact changes its velocity more than a slow contact.
 """
@@ -88,7 +88,7 @@ TIME_EXPONENT = np.kron([[3.0, 2.0], [2.0, 1.0]], np.ones((3, 3)))
 """Exponents of the time in the covariance that white accelerations add, shape (6, 6)."""
 
 SQUARED_GATE = 30.0
-"""Squared Mahalanobis distance of a frame above which it does not belong to a contact."""
+"""Squared Mahalanobis distance above which a frame does not belong to a contact."""
 
 MAX_GAP_s = 1.0
 """Time without a frame after which the tracked contact is discarded, s."""
@@ -97,7 +97,7 @@ WEAK_FLAGS = frozenset({SATURATED, BEYOND, MISFIT})
 """Flags of frames whose charges are wrong."""
 
 WEAK_VARIANCE_FACTOR = 100.0
-"""Factor by which the variance of a frame with such a flag is multiplied."""
+"""Factor by which the variance of a frame with a flag in `WEAK_FLAGS` is multiplied."""
 
 LARGEST_STD = np.array([100.0, 100.0, 3.0])
 """Largest standard deviations of measured x and y (mm) and ln F.
@@ -107,10 +107,10 @@ eigenvalues of the covariance of the state negative.
 """
 
 LARGEST_LOG_FORCE = 88.0
-"""Largest ln F of a smoothed contact, so that F is a finite number if the extrapolation of an outlier is absurd."""
+"""Largest ln F of a smoothed contact. With this limit, F is finite even if an outlier is extrapolated."""
 
 NOISE_INTERVAL_s = 0.0045
-"""Time after which the noise of two frames is independent, s. Boards filter their charges over shorter times."""
+"""Time between two frames above which their noise is independent, s. Boards filter charges over shorter times."""
 
 
 class NoiseEstimate:
@@ -201,10 +201,10 @@ class MotionFilter:
         return self._update(measured, covariance)
 
     def _predict(self, dt_s: float) -> None:
-        """Replace the modes by their prediction a time `dt_s` later, s. The mode may change within this time.
+        """Replace each mode by its prediction after the time `dt_s`, s. The contact may change its mode within this time.
 
-        First, the state of each new mode is mixed from the states of the previous modes from which it may come. Then
-        the mixed state is extrapolated by the motion of the new mode.
+        First, the states of the previous modes are mixed into one state for each new mode. Then the mixed state is
+        extrapolated by the motion of the new mode.
         """
         # Compute the probability of each new mode (row) for each previous mode (column). The position and the force
         # start or stop to change independently of each other, so the probabilities of the two quantities are
@@ -276,7 +276,8 @@ class ContactFilter:
     The errors of a model have two parts. The first part of the errors changes from frame to frame, such as the noise of
     the charges. The second part is the same in every frame of a held contact, such as the approximation error of the
     model and the errors of the gains. Smoothing reduces only the first part. The filter therefore weights the frames by
-    the variance of the first part alone, and adds the variance of the second part to that of the smoothed values.
+    the variance of the first part alone. The variance of the second part is added to the variance of the smoothed
+    values.
 
     The noise is estimated from all frames of a touch, even if the touch consists of several successive contacts.
 

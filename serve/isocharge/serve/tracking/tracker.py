@@ -19,16 +19,16 @@ from isocharge.serve.tracking.film_follower import FollowRule
 from isocharge.serve.tracking.motion_filter import ContactFilter, MAX_GAP_s
 
 SLIDE_PROBABILITY = 0.95
-"""Probability that the contact moves, above which it may slide."""
+"""Probability of a movement above which the contact may slide."""
 
 HOLD_TIME_s = 0.2
 """Time at rest after which a hold begins, and longest duration of a tap, s."""
 
 SLIDE_DISTANCE_mm = 0.3
-"""Distance from the position at which the contact last rested, above which a moving contact slides, mm."""
+"""Distance from the latest rest position above which a moving contact slides, mm."""
 
 REST_PROBABILITY = 0.5
-"""Probability that the contact moves, below which it is at rest."""
+"""Probability of a movement below which the contact is at rest."""
 
 
 class TouchEvents:
@@ -150,8 +150,8 @@ class Tracker(Stage):
 
         If another contact explains the charges as well, it is also added to the frame, as the attribute `other`.
 
-        The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. After a
-        time without a contact of more than `MAX_GAP_s`, a new filter begins. If the clock was set back, the touch
+        The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. If more
+        than `MAX_GAP_s` have passed without a contact, a new filter begins. If the clock was set back, the touch
         continues, because the time between the two frames counts as 0.
         """
         if frame.is_valid:
