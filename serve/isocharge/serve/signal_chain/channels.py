@@ -31,8 +31,8 @@ class GainRule(Rule, frozen=True, kw_only=True):
     Each setting is either a single number for all electrodes or a separate number for each electrode.
 
     Attributes:
-        pC_per_unit: Charge of one unit, pC. For a board that sends volts, it is the feedback capacitance of the
-            amplifiers in pF.
+        pC_per_unit: Charge of one unit, pC. For a board that sends volts, this charge is the feedback capacitance of
+            the amplifiers in pF.
         offset: Value that the board sends without charge, in the unit of the board.
     """
 
@@ -50,7 +50,7 @@ class GainRule(Rule, frozen=True, kw_only=True):
             raise WrongKey("pC_per_unit", "a finite number that is not 0, or one for each electrode", self.pC_per_unit)
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
-        """Convert values of one electrode, of any shape, to charges, pC. An unstated gain is 1."""
+        """Convert an array of values of one electrode to charges, pC. If the gain is not stated, it is 1."""
         gain_pC = self.pC_per_unit.get(electrode, 1.0) if isinstance(self.pC_per_unit, dict) else self.pC_per_unit
         offset = self.offset.get(electrode, 0.0) if isinstance(self.offset, dict) else self.offset
         return (values - offset) * gain_pC
@@ -60,11 +60,12 @@ class Channels:
     """Assignment of the channels of a board to the electrodes.
 
     The section `[channels]` of the device file states the name or the number of the channel of each electrode. Without
-    this section, the first of these rules that applies assigns the channels:
+    this section, the channels are assigned by the first rule in this list that applies:
 
-    - A channel belongs to the electrode whose name is among the words of the channel's name, as in `A_pC`, `charge.A`
-      or `electrode a`, or is the part in which the names of the channels differ, as in `chA`, `chB` and `chC`.
-    - If the names of all electrodes stand in the line of text, as in `C,A,B: 3,1,2`, the values have the same order.
+    - A channel belongs to an electrode if the name of the electrode is one of the words in the name of the channel, as
+      in `A_pC`, `charge.A` or `electrode a`. The name of the electrode may also be the part in which the names of the
+      channels differ, as in `chA`, `chB` and `chC`.
+    - If a line of text contains the names of all electrodes, as in `C,A,B: 3,1,2`, the values have the same order.
     - If there are as many channels as electrodes, both have the same order. Numbers in the names of the channels must
       then increase.
     """
@@ -77,7 +78,7 @@ class Channels:
             any_unit: Whether the names of the channels may contain any unit, even if the gain is not known.
 
         Raises:
-            DeviceError: If a key of `[channels]` is no electrode.
+            DeviceError: If a key of `[channels]` is not the name of an electrode.
         """
         gain = setup.device.rule(GainRule)
         self._allows_any_unit = any_unit or gain is not None
@@ -164,9 +165,10 @@ class Channels:
     def _matches(self, names: tuple[str, ...]) -> list[list[int]]:
         """Return, for each electrode, the indices of the names that belong to it.
 
-        A name belongs to an electrode if the name of the electrode is among its words, as in `A_pC`, or is the part in
-        which the names differ, as in `chA` and `chB`. Capital and small letters are not distinguished. If each
-        electrode has a name that is exactly its own, only these names count, so that `temp_C` is no name of C.
+        A name belongs to an electrode if one of its words is the name of the electrode, as in `A_pC`. The name of the
+        electrode may also be the part in which the given names differ, as in `chA` and `chB`. Capital and small letters
+        are not distinguished. If each electrode has a name that equals the electrode's name, only these names count.
+        For example, `temp_C` is then no name of the electrode C.
 
         Args:
             names: Names of channels, or words of a line of text.
@@ -221,7 +223,7 @@ class Channels:
 
 
 def channel_names(frame: Frame) -> tuple[str, ...]:
-    """Return the names of the channels of a frame. The name of a channel without a name is its number from 1."""
+    """Return the names of the channels of a frame. A channel without a name is named by its number, counted from 1."""
     names = frame.names or ("",) * len(frame.values)
     return tuple(name or str(number) for number, name in enumerate(names, 1))
 
@@ -250,7 +252,7 @@ def _words_of(text: str) -> list[str]:
 
 
 def _distinctive_parts(names: list[str]) -> list[str]:
-    """Return the part of each name that remains without the beginning and the end that all names have in common."""
+    """Return each name without the beginning and the end that all names have in common."""
     return _reversed_without_common_start(_reversed_without_common_start(names))
 
 
@@ -269,7 +271,7 @@ def _are_in_order(names: tuple[str, ...]) -> bool:
 def stated_unit(name: str) -> str:
     """Return the unit at the end of the name of a channel, such as nC for `A_nC`; empty if the name states no unit.
 
-    A final `C` is no unit, because C may be the name of an electrode. The case of the unit does not matter.
+    A final `C` is not a unit, because C may be the name of an electrode. The case of the unit does not matter.
     """
     *other_words, last_word = _words_of(name) or [""]
     units = {unit.casefold(): unit for unit in ("pC", *OTHER_CHARGE_UNITS) if unit != "C"}
@@ -289,7 +291,7 @@ class Gain(Stage):
     """Converts the values of the electrodes to charges in pC, with the offset, the sign and the gain of each channel.
 
     A frame with a value that cannot be a charge gets the flag `invalid`, and no charges. After invalid frames, the time
-    step of the next frame begins at the last valid frame.
+    step of the next valid frame begins at the last valid frame.
 
     Attributes:
         gain_pC: Charge per unit of the device, with sign, shape (n_electrode,), pC.
@@ -366,7 +368,7 @@ class SaturationRule(Rule, frozen=True, kw_only=True):
 
 
 class Saturation(Stage):
-    """Adds the flag `saturated` to the frames of a press in which an amplifier is, or has been, at its limit.
+    """Adds the flag `saturated` to the frames of a press, from the first frame in which an amplifier is at its limit.
 
     An amplifier is at its limit if the device reports this, or if the magnitude of a charge reaches the limit of the
     converter. All later frames of the press keep the flag.
@@ -383,7 +385,7 @@ class Saturation(Stage):
         self._is_saturated = False
 
     def step(self, frame: Frame) -> None:
-        """Add the flag `saturated` to a frame in which an amplifier is, or has been in this press, at its limit.
+        """Add the flag `saturated` to a frame if an amplifier is at its limit, or was there earlier in the press.
 
         An invalid frame is not changed.
         """

@@ -20,7 +20,7 @@ from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.stage import Divisor, Rule, Setting, Setup, Stage
 
 MIN_SQUARED_STEP = 0.02
-"""Smallest squared change of the unit phasor between two frames for an update of the hum, dimensionless."""
+"""Smallest squared change of the unit phasor between two frames with which the hum is updated, dimensionless."""
 
 
 class HumRule(Rule, frozen=True, kw_only=True):
@@ -44,7 +44,8 @@ class Hum(Stage):
     channel. The magnitude of the phasor is the amplitude of the hum, and its angle is the phase of the hum. The second
     number is a unit phasor, exp(2 pi i f t), that turns with the mains frequency f. The phasor of the channel is
     estimated from the differences between frames, which contain little of the touch charge. A frame is compared with
-    the previous one, or with an earlier one if the unit phasor has hardly changed since then.
+    the previous frame. If the unit phasor has hardly changed since the previous frame, an earlier frame is used
+    instead.
 
     The estimate follows the method of normalised least mean squares (Widrow and others 1975). Let z be the change of
     the unit phasor between the two frames. The phasor of the channel is changed by

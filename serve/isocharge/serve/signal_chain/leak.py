@@ -1,13 +1,13 @@
-"""Compensation of the leak of a charge amplifier, and integration of the currents of a board without such an amplifier.
+"""Compensation for the leak of charge amplifiers, and integration of currents from boards without charge amplifiers.
 
 A charge amplifier is a leaky integrator with the time constant tau = R C. The touch charge q follows from its output v
 frame by frame,
 
     q[n] = q[n-1] + i[n] - b dt,        i[n] = (v[n] - a v[n-1]) 2 / (1 + a),        a = exp(-dt / tau),
 
-where i is the innovation and b is the inflow (pC/s), a slow current into the amplifier because of offset, bias and slow
-warming. Of a charge that arrives between two frames, the share (1 + a) / 2 remains on average. The inflow is estimated
-from the innovation, because an estimate from the output v would diverge.
+where i is the innovation and b is the inflow (pC/s). The inflow is a slow current into the amplifier, which is caused
+by offset, bias and slow warming. On average, the share (1 + a) / 2 of a charge that arrives between two frames remains.
+The inflow is estimated from the innovation, because an estimate from the output v would diverge.
 
 A board that sends currents sends the innovation itself, i[n] = v[n]. The charge of such a board is the sum of the
 currents. If the device file states a leak, the sum decays with the time constant tau, q[n] = a q[n-1] + i[n] - b dt.
@@ -19,9 +19,9 @@ Frames of a touch must not change the estimated inflow. Therefore, three rules a
 During a touch, the correction uses the inflow that was estimated `look_back_s` before the touch. After a release, the
 estimate of the inflow pauses for the time `hold_off_s`.
 
-After a gap, the time at which a charge has arrived is unknown. The innovation of a charge that arrived at the beginning
-of the gap is i (1 + 1/a) / 2. If the gap may have falsified the charge of a touch, all frames of the touch have the
-flag `gap`.
+After a gap in the frames, the time at which a charge has arrived is unknown. The innovation of a charge that arrived at
+the beginning of the gap is i (1 + 1/a) / 2. If the gap may have falsified the charge of a touch, all frames of the
+touch have the flag `gap`.
 """
 
 import math
@@ -46,10 +46,10 @@ class LeakRule(Rule, frozen=True, kw_only=True):
         settle_s: Time constant of the estimate, s.
         hold_off_s: Pause of the estimate after a release, s.
         clip_sigmas: Limit to which an innovation is clipped, in standard deviations of an innovation at rest.
-        clip_pC: Smallest limit to which an innovation is clipped, pC.
+        clip_pC: Lower bound of the limit to which an innovation is clipped, pC.
         relax_s: Time constant with which the charge decays to zero out of contact, s.
-        look_back_s: Smallest age of the inflow with which a touch begins, and length of the interval over which this
-            inflow is averaged, s.
+        look_back_s: Smallest age of the inflow that is used during a touch, s. The same time is the length of the
+            interval over which this inflow is averaged.
     """
 
     tau_s: Positive | dict[str, Positive] = LARGEST
@@ -69,8 +69,8 @@ class Inflow:
 
     Attributes:
         pC_per_s: The inflow, shape (n_electrode,), pC/s.
-        learned_s: Time over which the inflow was averaged, s. For charges, it starts at 1 s, with an inflow of 0 as the
-            prior.
+        learned_s: Time over which the inflow was averaged, s. For a board that sends charges, this time starts at 1 s,
+            with an inflow of 0 as the prior.
         hold_s: Remaining time of the pause after a release, s.
     """
 
@@ -102,14 +102,14 @@ class Inflow:
         an averaging time and added to the inflow, so that the estimate becomes the mean current over this time. Large
         surpluses are clipped, because touches cause large surpluses.
 
-        A touch is detected some time after it has begun, and until then it has falsified the inflow. During a touch, an
-        older inflow is therefore used, which is the trusted inflow. After each time interval `look_back_s`, the
+        A touch is detected some time after its beginning, and falsifies the estimated inflow until then. During a
+        touch, an older inflow, the trusted inflow, is therefore used. After each time interval `look_back_s`, the
         candidate becomes the trusted inflow, and the mean inflow of the interval becomes the candidate. The mean has
         less noise than the latest inflow, which contains the whole noise of the latest frame.
 
         Args:
             surplus_pC: New charge minus the contribution of the inflow, shape (n_electrode,), pC.
-            noise_pC: Standard deviation of each electrode at rest, shape (n_electrode,), pC.
+            noise_pC: Standard deviation of the charge of each electrode at rest, shape (n_electrode,), pC.
             dt_s: Time since the previous frame, s.
         """
         rule = self._rule
@@ -231,19 +231,19 @@ class Leak(Stage):
         return (output_pC - decay * self._output_pC) * 2.0 / (1.0 + decay)
 
     def _inverse_decay(self, frame: Frame) -> Array:
-        """Return 1/a: the ratio of a charge before the leak of one frame to the same charge after it, (n_electrode,).
+        """Return 1/a, the ratio of a charge before the leak of one frame to the charge after it, shape (n_electrode,).
 
         The ratio is limited to avoid an overflow.
         """
         return np.exp(np.minimum(frame.dt_s / self._tau_s, 60.0))
 
     def _has_ended_in_gap(self, frame: Frame, surplus_pC: Array) -> bool:
-        """Return whether a touch has ended in a gap, during which frames were missing.
+        """Return whether a touch has ended while frames were missing.
 
-        When a touch ends, a charge arrives that cancels the charge of the touch. It is not known when it arrived. The
-        earlier it arrived, the more of it has leaked since, and the larger it must have been to cause the present
-        output. It is therefore largest if it arrived at the beginning of the gap. If even this charge does not cancel
-        the touch charge, the touch has not ended.
+        When a touch ends, a charge arrives that cancels the charge of the touch. The time of arrival is unknown. If the
+        cancelling charge arrived earlier, a larger part of this charge has leaked, so the charge must have been larger
+        to cause the present output. The cancelling charge is therefore largest if it arrived at the beginning of the
+        gap. If even this largest charge does not cancel the touch charge, the touch has not ended.
 
         Args:
             frame: The frame after the gap.
@@ -303,13 +303,13 @@ class Integrator(Leak):
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
 
         The current of a missing frame is assumed to be the mean of the currents before and after the gap. If this mean
-        is so small that it may only be noise, the current is assumed to be the inflow instead, which is the estimated
-        offset. The mean of two noisy currents would multiply the noise by the number of missing frames. The touch gets
-        the flag `gap` if the error of the assumed current may exceed both the noise and 1 % of the charge. A copy of
-        the previous frame adds no charge, and neither does a frame that arrives late.
+        is so small that it may be only noise, the current is assumed to be the estimated offset (the inflow) instead.
+        The mean of two noisy currents would multiply the noise by the number of missing frames. The touch gets the flag
+        `gap` if the error of the assumed current may exceed both the noise and 1 % of the charge. A copy of the
+        previous frame adds no charge, and neither does a frame that arrives late.
 
-        At rest, the charges decay with the time constant `relax_s`. The variance of the sum of independent currents is
-        then relax_s / (2 dt) times the variance of one current.
+        At rest, the charges decay with the time constant `relax_s`. For currents that are independent and have the
+        sampling interval dt, the variance of their sum is then relax_s / (2 dt) times the variance of one current.
         """
         self._elapsed_s += frame.dt_s
         self._interval_count += frame.intervals

@@ -31,7 +31,8 @@ Sums of such charges are exact to 1e-7 pC in double precision.
 SUM_TOLERANCE_s = 1e-5
 """Time by which a sum of sampling intervals may fall short of a limit, s.
 
-The sum then reaches the limit at the same frame in single precision, in which the chain in C can be compiled.
+With this tolerance, the sum reaches the limit at the same frame in single and in double precision. The signal chain in
+C can be compiled in single precision.
 """
 
 Setting = Annotated[float, Meta(ge=0, le=LARGEST)]
@@ -88,7 +89,7 @@ class Device(Board, frozen=True):
 
     Attributes:
         rules: Settings of each stage that is switched on, by their class.
-        table: Content of the device file without any conversion, which is stored in recordings.
+        table: Unconverted content of the device file, which is stored in recordings.
         where: Name of the file, for messages.
     """
 
@@ -129,7 +130,7 @@ class Setup:
         electrodes: Names of the electrodes, in the order of the charges.
         device: Settings of the board.
         predictor: The present model; None if a stream computes only touch charges.
-        reader: Name of the program part that needs these electrodes, for messages, such as "model three/1".
+        reader: Name of the part of the program that needs these electrodes, such as "model three/1", for messages.
         has_any_sign: Whether the charges of a touch may have any sign. Otherwise, most of them are positive.
     """
 
@@ -140,7 +141,7 @@ class Setup:
     has_any_sign: bool = False
 
     def __post_init__(self) -> None:
-        """Allow any sign for a board that sends currents."""
+        """Allow charges of any sign for a board that sends currents."""
         self.has_any_sign |= self.device.has_currents
 
     def use(self, predictor: Predictor) -> None:
@@ -175,7 +176,7 @@ class Setup:
 
 
 class Stage(ABC):
-    """One step on the way of a frame from its values to its record.
+    """One step of the processing that converts the values of a frame to a record.
 
     The object contains the settings and the state of the stage. A stage must be used in one thread only. Equal
     sequences of frames always give equal results.

@@ -24,11 +24,12 @@ class TareRule(Rule, frozen=True, kw_only=True):
     """Conditions for the frames from which the tare is measured, from the section `[tare]` of a device file.
 
     Attributes:
-        frames: Number of frames in a tare; 100 are 0.5 s at 200 Hz.
+        frames: Number of frames in a tare. At 200 Hz, 100 frames take 0.5 s.
         noise_limit_pC: Largest standard deviation of an electrode at rest, pC. The reference noise is 1 pC.
-        offset_limit_pC: Largest magnitude of the mean charge of an electrode at rest, pC. Under a press of 0.05 N or
-            more on a film of 25 um, the mean charge of three electrodes is larger. The tare therefore fails even if the
-            press is held still. If the board sends currents, there is no limit, because a held press causes no current.
+        offset_limit_pC: Largest magnitude of the mean charge of an electrode at rest, pC. A press of 0.05 N or more on
+            a film of 25 um causes mean charges above the default limit on three electrodes. The tare therefore fails
+            even if the press is held still. If the board sends currents, there is no limit, because a held press causes
+            no current.
         patience: Number of frames after which the search for quiet frames ends with an error; 0 for no limit.
         relax_s: Time constant with which the tare follows a slow drift while nothing touches the film, s. The tare
             changes by at most `noise_limit_pC / relax_s`, so that a touch does not change it noticeably.
@@ -41,7 +42,7 @@ class TareRule(Rule, frozen=True, kw_only=True):
     relax_s: Divisor = 2.0
 
     def unrest(self, mean_pC: Array, noise_pC: Array) -> str:
-        """Return why something seems to touch the film in some frames; empty if nothing touches it.
+        """Return the reason why something seems to touch the film in some frames; empty if nothing touches the film.
 
         Args:
             mean_pC: Mean charge of each electrode in the frames, shape (n_electrode,), pC.
@@ -132,7 +133,7 @@ class Tare(Stage):
         self._remaining_frames = math.inf
 
     def _change_pC(self, frame: Frame) -> Array | float:
-        """Return by how much the tare changes after a frame, shape (n_electrode,) or one number, pC.
+        """Return the change of the tare after a frame, shape (n_electrode,) or one number, pC.
 
         While something touches the film, only the warming of the film changes the tare. Otherwise, the charges of the
         frame are those of a film at rest, and the tare approaches them with the time constant `relax_s`. A large charge
@@ -149,7 +150,7 @@ class Tare(Stage):
         return approached_share * limited_charge_pC
 
     def _search(self, frame: Frame, charge_pC: Array) -> None:
-        """Add a frame to the latest frames, and measure the tare if these frames are enough and quiet.
+        """Add a frame to the latest frames, and measure the tare if there are enough frames and they are quiet.
 
         If the tare is switched off, the tare is 0.
 
@@ -179,7 +180,7 @@ class Tare(Stage):
             raise self._search_error(reason, frame)
 
     def _search_error(self, reason: str, frame: Frame) -> TareError:
-        """Return the error for a search without a result, with the present values of the board as settings.
+        """Return the error for a search without a result. The message contains the present values as settings.
 
         The search may have failed because the film is touched, or because the board has large offsets. If the board has
         large offsets, the present values are the offsets.

@@ -28,7 +28,7 @@ from isocharge.serve.frames.frame import Frame
 from isocharge.serve.signal_chain.stage import NOT_IN_C, Divisor, Rule, Setting, Setup, Stage, SUM_TOLERANCE_s
 
 TRIED_PC = np.array([-20.0, -10.0, 0.0, 10.0, 20.0])
-"""Changes of the common charge at which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
+"""Changes of the common charge for which the misfit is evaluated, pC. A parabola is fitted to the squared misfits."""
 
 # Pseudo-inverse for a least-squares fit: the product with the squared misfits gives the coefficients of the parabola.
 _PARABOLA_FIT = np.linalg.pinv(np.column_stack([np.ones(5), TRIED_PC, TRIED_PC**2]))
@@ -46,8 +46,8 @@ class ThermalRule(Rule, frozen=True, kw_only=True):
     Attributes:
         every_s: Time between two estimates, s.
         wander_pC: Standard deviation of the change of p in one second, pC. The default of 50 pC is the charge of an
-            electrode of 9 mm^2 for a change of 0.19 K. A film of 25 um changes its temperature about as fast after a
-            step of the air temperature by half a kelvin.
+            electrode of 9 mm^2 for a change of 0.19 K. After a step of the air temperature by half a kelvin, the
+            temperature of a film of 25 um changes about as fast.
         noise: Factor by which the errors of the model increase the standard deviation of an estimate.
         blind_pC: Standard deviation of an estimate above which temperature cannot be distinguished from force, pC.
         tell_pC: Smallest absolute value of p with which a record has the flag `thermal`, pC.
@@ -91,7 +91,7 @@ class Warming(Stage):
         self._is_blind = False  # whether temperature could not be distinguished from force at the last estimate
 
     def step(self, frame: Frame) -> None:
-        """Estimate the warming of a frame in contact, subtract the charge that its change causes, and add the flags.
+        """Estimate the warming during a touch, subtract the charge that a change of the warming causes, and add flags.
 
         The tare has already subtracted the charge of the earlier changes, and reads the present change from the frame.
         While an amplifier is saturated, the warming is not estimated, because then the charges fit no contact for any
@@ -117,11 +117,11 @@ class Warming(Stage):
     def _estimate(self, charge_pC: Array, dt_s: float) -> float:
         """Update the estimate of the charge p that warming has added to each electrode, and return its change, pC.
 
-        The estimate (`_charge_pC`) and its variance (`_variance_pC2`) are those of a Kalman filter. A change of p is
+        A Kalman filter computes the estimate (`_charge_pC`) and its variance (`_variance_pC2`). A change of p is
         measured as follows. Trial values of the change are subtracted from the charges. The misfit of a trial value is
-        the distance of the remaining charges from those of the nearest contact. A parabola is fitted to the squared
-        misfits, and its minimum is the measured change. If the parabola is too flat, warming cannot be distinguished
-        from force. The estimate is then not changed.
+        the distance of the remaining charges from the charges of the nearest contact. A parabola is fitted to the
+        squared misfits, and its minimum is the measured change. If the parabola is too flat, warming cannot be
+        distinguished from force. The estimate is then not changed.
 
         Args:
             charge_pC: Touch charges from which the present estimate has been subtracted, shape (n_electrode,), pC.

@@ -1,11 +1,11 @@
-"""Detection of a touch from the charges of all electrodes, which are a vector in units of the noise.
+"""Detection of a touch from the vector of the charges of all electrodes, in units of the noise.
 
 Each charge is divided by the touch threshold of its electrode. The size of the charges is the norm of the vector of
 these ratios, so it does not depend on their signs.
 
 The detection has a hysteresis. A touch begins when the size of the difference from the base exceeds 1. A touch ends
-when the size of the charges falls below a given share of the largest size of this touch. If the threshold for the end
-did not depend on the touch, a touch would never end after the charge at rest has drifted above this threshold.
+when the size of the charges falls below a given share of the largest size of this touch. With a fixed threshold for the
+end, a touch would never end if the charge at rest had drifted above this threshold.
 """
 
 import math
@@ -23,14 +23,15 @@ from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Share, Stag
 class TouchRule(Rule, frozen=True, kw_only=True):
     """Thresholds for the detection of a touch, from the section `[touch]` of a device file.
 
-    With the reference noise, a press that is equal on three electrodes needs a total charge of 20 pC. A press of 0.05 N
-    on a film with a thickness of 25 um gives a total charge of 340 pC. If the force of a press falls from 2 N to 0.05
-    N, the charges fall to 8 % of their peak, so the touch does not end.
+    With the reference noise, a press with equal charges on three electrodes is detected from a total charge of 20 pC. A
+    press of 0.05 N on a film with a thickness of 25 um gives a total charge of 340 pC. If the force of a press falls
+    from 2 N to 0.05 N, the charges fall to 8 % of their peak, so the touch does not end.
 
     Attributes:
         sigmas: First part of the touch threshold, in standard deviations of the size of the noise.
-        floor_pC: Second part of the touch threshold, pC: the total charge of a press that is equal on all electrodes.
-            The touch threshold is the sum of both parts. None stands for 10 pC, or for 0 if the board sends currents.
+        floor_pC: Second part of the touch threshold, pC: the total charge of a press with equal charges on all
+            electrodes. The touch threshold is the sum of both parts. None stands for 10 pC, or for 0 if the board sends
+            currents.
         release_share: Release threshold, relative to the peak of the press. The release threshold is at least half of
             the touch threshold. None stands for 0.05, or for 0.3 if the board sends currents, because their integral
             does not return to zero exactly.
@@ -41,7 +42,7 @@ class TouchRule(Rule, frozen=True, kw_only=True):
     release_share: Share | None = None
 
     def resolved(self, *, has_currents: bool) -> "TouchRule":
-        """Return the settings with the default values for a board that sends charges, or currents."""
+        """Return the settings, with default values for this kind of board instead of None."""
         floor_pC, release_share = (0.0, 0.3) if has_currents else (10.0, 0.05)
         return structs.replace(
             self,
@@ -52,9 +53,9 @@ class TouchRule(Rule, frozen=True, kw_only=True):
     def threshold_pC(self, noise_pC: Array) -> Array:
         """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.
 
-        The threshold has two parts: a multiple of the noise that the noise of all electrodes together rarely exceeds,
-        and a constant part, the floor. The norm of the noise of n electrodes, in standard deviations, has a mean of
-        about sqrt(n) and a standard deviation of about sqrt(1/2).
+        The threshold has two parts. The first part is a multiple of the noise, and the noise of all electrodes together
+        rarely exceeds this part. The second part is constant, and is called the floor. The norm of the noise of n
+        electrodes, in standard deviations, has a mean of about sqrt(n) and a standard deviation of about sqrt(1/2).
 
         Args:
             noise_pC: Standard deviation of the charge of each electrode at rest, shape (n_electrode,), pC.
@@ -72,11 +73,11 @@ RISE_S = 0.1
 
 After the same time with small charges, the direction of the latest touch no longer matters.
 
-The charges of a press of a film of 25 um rise slowly if its force grows by less than about 0.005 N/s.
+On a film of 25 um, the charges rise slowly if the force of a press grows by less than about 0.005 N/s.
 """
 
 OPPOSING_COSINE = -0.25
-"""Cosine of the angle to the latest touch below which a change of the charges is the opposite of a touch.
+"""Cosine of the angle between a change of the charges and the latest touch, below which both are opposite.
 
 The charges of a touch may have any sign, so the angle of another touch is about 90 degrees or less.
 """
@@ -89,10 +90,10 @@ class Touch(Stage):
     of the charges that remained after the last release. The base follows charges that fall further, and decays
     exponentially.
 
-    After a long press, an amplifier with a leak shows charges of the opposite sign. Charges or a change of the charges
-    in the direction opposite to the latest touch are therefore no touch. After such a change, the base becomes the mean
-    of the latest charges. If all charges of a film are known to be positive, the same rules apply to charges that
-    become negative before the first touch.
+    After a long press, an amplifier with a leak shows charges of the opposite sign. Charges that are opposite to the
+    latest touch are therefore not a touch, and neither is a change of the charges in the opposite direction. After a
+    change in the opposite direction, the base becomes the mean of the latest charges. If all charges of a film are
+    known to be positive, the same rules apply to charges that become negative before the first touch.
 
     A touch ends when the size of the charges falls below the release threshold. A touch also ends when the charges
     change their sign from one frame to the next. On a film whose charges are positive, a touch ends when the charges
@@ -102,8 +103,8 @@ class Touch(Stage):
 
     If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
     charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then
-    have the flag `drift`. For a board that sends currents, three quarters of the threshold must be exceeded. A touch
-    also has the flag if the latest charges were opposite to it, as after a long press with a leak.
+    have the flag `drift`. For a board that sends currents, the limit is three quarters of the threshold. A touch also
+    has the flag `drift` if the charges before the touch were opposite to the touch, as after a long press with a leak.
 
     If charges exceed the touch threshold in the direction opposite to a touch, the frame has the flag `negative`.
     """
@@ -194,17 +195,18 @@ class Touch(Stage):
         """Process a frame while nothing touches the film: begin a touch, or update the base.
 
         The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, it decays to zero. The
-        change is the difference of the charges from the base. The first of these rules that applies is used:
+        change is the difference between the charges and the base. The first rule in this list that applies is used:
 
-        - If the change is opposite to the expected direction, it is a release or a drift. The base becomes the mean of
-          the latest charges (`_idle_mean_charge`).
+        - If the change is opposite to the expected direction, a release or a drift has caused the change. The base
+          becomes the mean of the latest charges (`_idle_mean_charge`).
         - If both the charges and the change exceed the threshold, and the charges are not opposite to the expected
           direction, a touch begins.
-        - If the base is what remains of the latest touch, and the charges are smaller, they become the base.
+        - If the base is a remainder of the latest touch, and the charges are smaller than the base, the charges become
+          the new base.
 
-        While charges of the latest touch may remain, the expected direction is that of the latest touch. Later, the
-        expected charges are positive and equal. If touches may have charges of any sign, the expected direction is the
-        zero vector, with which every direction is accepted.
+        While charges of the latest touch may remain, the expected direction is the direction of the latest touch.
+        Later, the expected charges are positive and equal. If touches may have charges of any sign, the expected
+        direction is the zero vector, with which every direction is accepted.
 
         Args:
             frame: The frame.

@@ -201,7 +201,7 @@ class MotionFilter:
         return self._update(measured, covariance)
 
     def _predict(self, dt_s: float) -> None:
-        """Replace each mode by its prediction after the time `dt_s`, s. The contact may change its mode within this time.
+        """Replace each mode by its prediction after the time `dt_s`, s. The contact may change its mode in this time.
 
         First, the states of the previous modes are mixed into one state for each new mode. Then the mixed state is
         extrapolated by the motion of the new mode.
