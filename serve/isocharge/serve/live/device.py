@@ -64,7 +64,7 @@ class NoiseRule(Rule, frozen=True, kw_only=True):
 
 
 def predictor_for(device: Device, predictor: Predictor) -> Predictor:
-    """Return a predictor for the noise that a device file states, or the same predictor without such a statement."""
+    """Return a predictor for the noise that a device file states, or the same predictor if the file states no noise."""
     noise = device.rule(NoiseRule)
     return predictor if noise is None else predictor.with_noise(noise.white_pC, noise.gain)
 
@@ -72,8 +72,9 @@ def predictor_for(device: Device, predictor: Predictor) -> Predictor:
 class Prediction(Stage):
     """Predicts the contact of each frame with the present model, for the noise that the device file states.
 
-    If the noise at rest before a touch is much larger, the standard deviations of the touch are those for this noise. A
-    small difference has no effect, because the tare measures the noise with few frames and therefore inaccurately.
+    If the noise at rest before a touch is much larger, the standard deviations of the touch are computed for this
+    noise. A small difference has no effect, because the tare measures the noise with few frames and therefore
+    inaccurately.
     """
 
     section = "noise"
@@ -82,7 +83,7 @@ class Prediction(Stage):
     needs_contact = True
 
     def __init__(self, setup: Setup) -> None:
-        """Create the predictor for the noise of the board, and store it in the setup for the later stages, too.
+        """Create the predictor for the noise of the board, and store the predictor in the setup for the later stages.
 
         A contact is valid within the working area and the forces of this predictor.
         """
@@ -94,7 +95,7 @@ class Prediction(Stage):
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges.
 
         In the first frame of a touch, the predictor of the touch is chosen. If the noise at rest is much larger than
-        the noise of the model, the standard deviations of the touch are those for the noise at rest.
+        the noise of the model, the standard deviations of the touch are computed for the noise at rest.
         """
         if frame.charge_pC is None or not frame.is_contact:
             self._touch_predictor = None
@@ -142,7 +143,8 @@ def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:
 
     Args:
         setup: Settings and objects that the stages share.
-        needs_contact: Whether to create the stages that process contacts, or the stages before them.
+        needs_contact: Whether to create the stages that process contacts. Otherwise, the stages before them are
+            created.
 
     Raises:
         DeviceError: If a setting states numbers for other electrodes than the given ones, or if warming must be

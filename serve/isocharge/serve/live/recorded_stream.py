@@ -93,7 +93,7 @@ class RecordedStream:
         before it is yielded. When the caller closes the generator, the recording ends, too.
 
         The bytes up to the first frame (`_preamble`) are stored, because they show the layout of the frames. A
-        recording that was requested during the stream begins with them.
+        recording that was requested during the stream begins with these bytes.
 
         Args:
             chunks: Chunks of bytes from a port or from a file.
@@ -136,8 +136,9 @@ class RecordedStream:
     def _begin_again(self, recorder: Recorder, chunk: Chunk) -> Chunk:
         """Restart the stream, and process the first bytes of the stream again, for a new recording.
 
-        The records of the new recording then depend only on the bytes in this recording. Its first chunk contains the
-        first bytes, from which a replay learns the layout of the frames. This chunk is written without records.
+        The records of the new recording then depend only on the bytes in this recording. The first chunk of the
+        recording contains the first bytes of the stream, from which a replay learns the layout of the frames. This
+        chunk is written without records.
 
         Args:
             recorder: Recorder of the new recording.
@@ -164,7 +165,7 @@ class RecordedStream:
             self.recorder.event(**event)
 
     def _begin_loading(self, load: Load) -> None:
-        """Load a model in another thread, so that the stream does not have to wait, and then request its use."""
+        """Load a model in another thread, so that the stream need not wait, and request the use of the loaded model."""
         self._loader.submit(load).add_done_callback(
             lambda loaded: self._requests.append(partial(self._use_loaded_model, loaded))
         )
@@ -247,8 +248,7 @@ def replay(
         elif event.tare:
             stream.tare()
         elif chunk is not None:
-            # The first chunk is due at once, and each later chunk as long after the previous one as it arrived after
-            # it.
+            # The first chunk is due at once. The time between two chunks is the same as between their arrivals.
             due_s = due_s + elapsed_s(previous_chunk, chunk) if previous_chunk else time.monotonic()
             previous_chunk = chunk
             if real_time:

@@ -67,8 +67,8 @@ class WatchResult(NamedTuple):
     """Result that a `PressWatch` returns for one reading.
 
     Attributes:
-        phase: What the watch waits for. It is `taken` or `refused` only for the reading with which a press was accepted
-            or refused.
+        phase: What the watch waits for. The phase is `taken` or `refused` only for the reading with which a press was
+            accepted or refused.
         reason: Reason why the press is refused or is not steady yet, as a part of a sentence.
         press: The accepted press if the phase is `taken`, and otherwise None.
     """
@@ -116,9 +116,9 @@ class PressWatch:
     """Standard deviation of the additional noise of a press, relative to its charge. The force of a hand varies."""
 
     MAX_RELATIVE_DRIFT = 0.005
-    """Largest drift of a charge over the window, relative to its magnitude or to the mean magnitude of all charges.
+    """Largest drift of a charge over the window, relative to its magnitude or the mean magnitude of all charges.
 
-    A drift of this size changes the position by about 0.05 mm.
+    The larger of the two magnitudes is used. A drift of this size changes the position by about 0.05 mm.
     """
 
     DRIFT_SIGMAS = 4.0
@@ -172,7 +172,7 @@ class PressWatch:
         phase `lift` follows until the finger leaves the film. The phase `waiting` then begins again.
 
         The result for the reading with which a press is accepted or refused has the phase `taken` or `refused`. The
-        phase of the watch itself is then already the next one, because the reading after this one continues with it.
+        watch itself has then already begun the next phase, with which the next reading continues.
 
         The charges at rest before a press are measured in a period of the length `REST_S`, which ends `EDGE_S` before
         the touch is detected.
@@ -239,8 +239,8 @@ class PressWatch:
         residuals from the line. The drift of a charge is the change of its line from the beginning to the end of the
         window. The charges scatter because of the noise at rest, and because a hand varies its force.
 
-        The reason is that of the window with the smallest scatter, because the reason of a window with a sudden
-        movement, such as the release, would only describe the movement.
+        The stored reason belongs to the window with the smallest scatter. The reason from a window with a sudden
+        movement, such as the release, would describe only this movement.
 
         Args:
             rest_pC: Mean charges just before the touch, shape (n_electrode,), pC.
@@ -286,7 +286,7 @@ class PressWatch:
             flags = flags_in_order(flag for frame in self._frames for flag in frame.flags)
             return SteadyPress(mean_pC, self._end_s - self._begin_s, flags)
 
-        # Store the reason, but keep that of an earlier window with a smaller scatter.
+        # Store the reason, but keep the reason from an earlier window with a smaller scatter.
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = scatter_pC.max()
             self._reason = reason

@@ -98,7 +98,7 @@ class ReadingStream:
             stage.reset()
 
     def frames(self, chunk: Chunk) -> Iterator[Frame]:
-        """Process a chunk, pass each frame whose last byte it contains through all stages, and yield the frame.
+        """Pass each frame whose last byte is in a chunk through all stages, and yield the frame.
 
         Raises:
             ChargeError: If a frame has no value for an electrode.
@@ -111,7 +111,7 @@ class ReadingStream:
             yield frame
 
     def _received_frames(self, chunk: Chunk) -> list[Frame]:
-        """Return the frames whose last byte a chunk contains, with their times and the flags of their sequence.
+        """Return the frames whose last byte is in a chunk, with their times and the flags from their sequence numbers.
 
         If the chunk follows an outage of the port, the state before the outage is discarded first.
 
@@ -129,8 +129,8 @@ class ReadingStream:
         self._dropped_at_frame = parser.counts.bytes_dropped
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
-            # The number of intervals since the previous frame is 1, and larger by the number of lost frames between
-            # them. It is 0 for a late frame, because this frame was counted as lost before, and for a repeated frame.
+            # The number of intervals since the previous frame is 1 plus the number of lost frames between them. The
+            # number is 0 for a late frame, because this frame was counted as lost before, and for a repeated frame.
             lost_before = parser.counts.lost
             sequence_flags = parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)
             frame.intervals = 1 + parser.counts.lost - lost_before
@@ -151,9 +151,10 @@ class ReadingStream:
             self._check_recognised(max_bytes=-1)  # raises an error, even if no bytes have arrived
 
     def _check_recognised(self, max_bytes: int = 8192) -> None:
-        """Report that more than `max_bytes` bytes have arrived since the latest frame, none of them an intact frame.
+        """Raise an error if more than `max_bytes` bytes have arrived without an intact frame.
 
-        After the first frame, this is only a warning, because a disturbance may end.
+        The bytes are counted from the latest frame. After the first frame, a warning is logged instead of the error,
+        because a disturbance may end.
 
         Raises:
             NoFramesError: If the stream has contained no frame.
@@ -198,9 +199,9 @@ class TouchStream(ReadingStream):
     Each object may be used by only one thread.
 
     Attributes:
-        predictor: The loaded model. If the film is followed, its contacts are then corrected.
+        predictor: The loaded model. If the film is followed, a later stage corrects the contacts of the model.
         frame_id: Name of the film, which each record contains.
-        sections: Sections of the device file whose stages process contacts, which may add fields to the records.
+        sections: Sections of the device file whose stages process contacts. These stages may add fields to the records.
     """
 
     def __init__(
