@@ -39,7 +39,7 @@ WRENCH_TOPIC = "/isocharge/wrench"
 POSE_TOPIC = "/isocharge/pose"
 
 FLUSH_INTERVAL_S = 1.0
-"""Longest time for which records wait in memory, s. These records are lost if the process is killed."""
+"""Longest time for which records wait in memory, s. The waiting records are lost if the process is killed."""
 
 
 class McapFile(FileOutput):
@@ -54,7 +54,7 @@ class McapFile(FileOutput):
 
         Args:
             path: The file, which must not exist.
-            electrodes: Names of the electrodes, for the schema.
+            electrodes: Names of the electrodes, which the schema of the records contains.
             is_ros2: Whether the records are ROS 2 messages, for tools that refuse all other messages (`ros2 bag`,
                 rosbags). Otherwise the records are JSON with a schema for viewers.
             is_live: Whether the records come from a sensor.
@@ -109,5 +109,5 @@ class McapFile(FileOutput):
 
     def close(self) -> None:
         """Write the index of the messages, and close the file. In a replay, also rename the file."""
-        with self._stack:  # in a replay, it removes the file after an error
+        with self._stack:  # in a replay, the stack removes the file after an error
             self._writer.finish()  # type: ignore[no-untyped-call]

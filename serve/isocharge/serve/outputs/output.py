@@ -35,7 +35,7 @@ class Output(Protocol):
     """
 
     def write(self, record: PredictionRecord, /) -> None:
-        """Write a record, which must not be changed, because the other outputs receive the same record.
+        """Write a record. The method must not change the record, because the other outputs receive the same record.
 
         If this method raises an exception in a live stream, the output receives no more records, and the stream
         continues without this output.
@@ -53,7 +53,7 @@ class OutputContext(NamedTuple):
 
     Attributes:
         electrodes: Names of the electrodes, in the order of the charges.
-        sections: Sections of the device file whose stages process contacts, which may add fields to the records.
+        sections: Sections of the device file whose stages process contacts. These stages may add fields to the records.
         is_live: True if the records come from a sensor, which does not wait for the outputs. False if they come from a
             recording.
         write_stdout: Function that writes a text to standard output.
@@ -71,11 +71,11 @@ class OutputKind(NamedTuple):
     Attributes:
         form: Form of the targets, for help and messages, such as `FILE.csv`.
         accepts: Function that returns whether the text of a target has this form.
-        open: Function that opens the output with the given target. It raises an `IsochargeError` or an `OSError` if
-            this is impossible.
+        open: Function that opens the output with the given target. The function raises an `IsochargeError` or an
+            `OSError` if the output cannot be opened.
         is_standard_output: Whether the output writes to standard output. Only one output of a command may write to
             standard output. The stream ends when standard output is closed.
-        plugin: Name of the output in messages. It is set when the entry point of another package is loaded.
+        plugin: Name of the output in messages. The name is set when the entry point of another package is loaded.
     """
 
     form: str
@@ -103,7 +103,8 @@ class WriterQueue(Generic[T]):
 
     Attributes:
         lost: Number of items that were dropped without being written, or that could not be written.
-        error: Exception with which `write` has ended the thread; None if there is none, or if `put` has raised it.
+        error: Exception with which `write` has ended the thread. None if there is no exception, or if `put` has already
+            raised the exception.
     """
 
     def __init__(self, write: Callable[[T], object]) -> None:
@@ -133,7 +134,7 @@ class WriterQueue(Generic[T]):
             item: The item.
 
         Raises:
-            Exception: The exception that `write` has raised in the thread, if there is one.
+            Exception: If `write` has raised an exception in the thread, the same exception.
         """
         error = self.error
         if error is not None:
@@ -158,8 +159,8 @@ class WriterQueue(Generic[T]):
             earlier_count = self._written_count
             self._thread.join(CLOSE_TIMEOUT_s)
 
-        # End the thread. If it ends at the final None, the queue is empty. Otherwise, the queue contains the lost items
-        # and the None, which counts for one more lost item: the item that the thread had taken but not written.
+        # End the thread. If the thread ends at the final None, the queue is empty. Otherwise, the queue contains the
+        # lost items and the None. The None counts for one more lost item, which the thread had taken but not written.
         self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
         self.lost += self._items.qsize()
@@ -215,7 +216,7 @@ class FileOutput:
 
 
 def is_file_with(suffix: str) -> Callable[[str], bool]:
-    """Return a function that returns whether a target is the path of a file whose name ends with `suffix`.
+    """Return a function that checks whether a target is the path of a file whose name ends with `suffix`.
 
     A target with a scheme, such as `mqtt://host/touch.csv`, is not a file.
     """
@@ -223,7 +224,7 @@ def is_file_with(suffix: str) -> Callable[[str], bool]:
 
 
 class JsonLines:
-    """Output that writes each record as a line of JSON, such as to standard output."""
+    """Output that writes each record as a line of JSON, for example to standard output."""
 
     def __init__(self, write_text: Callable[[str], object], _: OutputContext) -> None:
         """Store the function that writes a text."""
@@ -275,7 +276,7 @@ class TextFile(FileOutput):
 
 
 def _text_kinds(name: str, suffix: str, lines: type[JsonLines]) -> tuple[OutputKind, OutputKind]:
-    """Return the kinds of outputs that write lines to standard output and to a file.
+    """Return two kinds of outputs, which write lines to standard output and to a file.
 
     Args:
         name: Target of standard output.

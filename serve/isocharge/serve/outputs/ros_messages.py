@@ -28,7 +28,7 @@ DEFLECTION_STD_m = 5e-3
 """Standard deviation of z, m. The model does not estimate the deflection of the film, which is a few millimetres."""
 
 ROTATION_VARIANCE_rad2 = math.pi**2 / 3.0
-"""Variance of every rotation, rad^2. It is the variance of an angle that is uniformly distributed over a full turn."""
+"""Variance of every rotation, rad^2: the variance of an angle that is uniformly distributed over a full turn."""
 
 ENCAPSULATION = b"\x00\x01\x00\x00"
 """First bytes of a CDR message: little endian, no options."""
@@ -90,7 +90,7 @@ def ros_time_ns(record: Mapping[str, Any]) -> int:
 
 
 def with_tracked_contact(record: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the values of a record, in which the tracked contact replaces the contact of the single frame.
+    """Return the values of a record with the tracked contact instead of the contact of the single frame.
 
     The values are unchanged if the record has no tracked contact, or if the force in the single frame is unknown.
 

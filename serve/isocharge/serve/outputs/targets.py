@@ -29,7 +29,7 @@ ROS2_SUFFIX = ".ros2.mcap"
 
 
 def _open_mcap(target: str, context: OutputContext) -> Output:
-    """Create the MCAP file at the path `target`; the end of its name states whether the records are ROS 2 messages."""
+    """Create the MCAP file at the path `target`. The end of the path decides whether records are ROS 2 messages."""
     from isocharge.serve.outputs.mcap_file import McapFile  # needs the extra `record`
 
     is_ros2 = target.endswith(ROS2_SUFFIX)
@@ -104,7 +104,8 @@ class Outputs:
         """Determine the kind of output for each target, without opening the outputs.
 
         Args:
-            targets: Targets of the outputs, such as `json` or `touch.csv`. A target that occurs twice has one output.
+            targets: Targets of the outputs, such as `json` or `touch.csv`. A target that occurs twice gets only one
+                output.
             context: Properties of the stream, which are passed to each output.
 
         Raises:
@@ -127,7 +128,7 @@ class Outputs:
 
     @contextmanager
     def _named_errors(self, target: str) -> Iterator[None]:
-        """Convert the errors of an output to errors that state their cause, the target, and what the user can do."""
+        """Convert errors of an output to errors that state the cause, the target, and what the user can do."""
         with plugin_errors(target, self._kinds[target].plugin), as_output_errors(target):
             yield
 
@@ -185,8 +186,8 @@ class Outputs:
     def _handle_error(self, target: str, error: Exception) -> None:
         """Raise the error of an output, or write it to the log and write no further records to the output.
 
-        The error is raised in a replay, and if the output is standard output. A live stream continues without any other
-        output that has failed. Only the first error of an output is written to the log.
+        In a replay, every error is raised. In a live stream, only an error of standard output is raised, and the stream
+        continues without any other output that has failed. Only the first error of an output is written to the log.
 
         Raises:
             Exception: The error, with its cause and the target.
@@ -205,19 +206,20 @@ class Outputs:
         """Close all open outputs, and store in `not_written` how many records each output has not received.
 
         Raises:
-            BaseException: An error that occurred, or Ctrl-C. All other outputs are closed before it is raised.
+            BaseException: An error that occurred, or Ctrl-C. All other outputs are closed before the exception is
+                raised.
         """
         self._stack.close()
 
     def _close_or_discard(self, target: str, output: Output, queue: WriterQueue[PredictionRecord] | None) -> None:
         """Close an output if it contains all records, and otherwise discard it.
 
-        An output is incomplete in three cases: a replay was stopped, another output could not be opened (in both cases,
-        all outputs are discarded, `_is_discarded`), or this output has failed. An error while all outputs are discarded
+        An output is incomplete in three cases: a replay was stopped, another output could not be opened, or this output
+        has failed. In the first two cases, all outputs are discarded (`_is_discarded`). An error that occurs meanwhile
         is only written to the log, because the error that has ended the command is more important.
 
         Args:
-            target: Target of the output, by which messages name it.
+            target: Target of the output, which messages use as its name.
             output: The output, which is open.
             queue: Queue of the thread that writes the records of a live stream; None in a replay.
 
@@ -251,7 +253,7 @@ class Outputs:
             self.not_written[target] = None  # the number of missing records is unknown
 
     def _discard(self, output: Output) -> None:
-        """Discard an output or, if it has no method `discard`, close it. Remove a file without records."""
+        """Discard an output, or close an output that has no method `discard`. Remove a file without records."""
         discard_or_close = getattr(output, "discard", output.close)
         discard_or_close()
         if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
