@@ -48,7 +48,7 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
 
 @cache
 def _columns(electrodes: tuple[str, ...], sections: tuple[str, ...]) -> list[tuple[str, str | None]]:
-    """Return two names for each column: the name of its field, and the name of the part of the field in the column.
+    """Return two names for each column: the name of the field, and the name of the part that the column contains.
 
     The parts of charges are the electrodes, and the parts of an object are its fields. The part is None for a field
     with one column.
@@ -59,7 +59,7 @@ def _columns(electrodes: tuple[str, ...], sections: tuple[str, ...]) -> list[tup
 def _part_names(field: Field, electrodes: Sequence[str]) -> Sequence[str | None]:
     """Return the names of the numbers in an object: the fields of a struct, or the electrodes.
 
-    A field of another type is a single part without a name, which is None.
+    For a field of another type, the result is a single None, because the field has no parts.
     """
     if field.json_type != "object":
         return [None]

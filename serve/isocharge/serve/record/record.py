@@ -17,7 +17,7 @@ from isocharge.serve.flags import MEANINGS
 from isocharge.serve.model.contact import Contact
 
 Charges = dict[str, float | None]
-"""Charges by the name of the electrode, pC; None if the device sent no number."""
+"""Charges by the name of the electrode, pC. A charge is None if the device sent no number for the electrode."""
 
 JSON_TYPES: dict[Any, str] = {
     float: "number",
@@ -38,7 +38,7 @@ class Field(NamedTuple):
         json_type: Type of the value in JSON. An array contains texts. An object contains numbers.
         meaning: Description of the value, a sentence.
         may_be_null: Whether the value may be null, because it is unknown.
-        parts: Fields of a struct; empty for any other value, also for an object with a number for each electrode.
+        parts: Fields of a struct; empty for any other value, such as an object with a number for each electrode.
         section: Section of the device file that adds the field to the records; empty for a field that every record has.
     """
 
@@ -55,7 +55,7 @@ def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
 
     The annotation of each field contains a sentence that describes the value, and the section of the device file that
     adds an optional field, as in `Annotated[str | None, "Event that begins.", "track"]`. An attribute without such an
-    annotation is no field of the JSON object.
+    annotation is not a field of the JSON object.
     """
     fields: list[Field] = []
     for name, annotation in get_type_hints(struct, include_extras=True).items():  # with the metadata of `Annotated`
@@ -207,7 +207,7 @@ NO_CONTACT: dict[str, Any] = UNKNOWN_CONTACT | {"force_N": 0.0}
 
 
 def flags_in_order(flags: Iterable[str]) -> tuple[str, ...]:
-    """Return each of the flags once, in the order of `MEANINGS`, in which a record contains them."""
+    """Return each of the flags once, in the order of `MEANINGS`. A record contains its flags in this order."""
     present = set(flags)
     return tuple(flag for flag in MEANINGS if flag in present)
 
