@@ -36,7 +36,7 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
 
 
 def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> dict[str, list[Array]]:
-    """Return the polygons of each electrode at the place that a calibration has determined, if there is one.
+    """Return the polygons of each electrode at its calibrated place, or at its designed place without a calibration.
 
     The first polygon of an electrode is its pad. All further polygons describe additional metal that belongs to the
     electrode, such as leads.

@@ -51,7 +51,7 @@ PAGE_LIMITS = ServerLimits(body_bytes=1 << 12, connections=64)
 """Limits of the server of the page. A browser uses one or two connections, and its requests are short."""
 
 MAX_MARKERS = 200
-"""Number of the latest markers that the page shows."""
+"""Largest number of markers that the page shows. The page shows the latest markers."""
 
 MAX_MARKER_CHARACTERS = 80
 """Largest number of characters in the text of a marker."""
@@ -157,13 +157,13 @@ class LivePage(Application):
         self.tape.append(sample_values(record, self._electrodes))
 
     def update(self, **values: Any) -> None:
-        """Replace values of the state, which the page shows beside the samples, such as counters."""
+        """Replace values of the state, such as counters. The page shows the state beside the samples."""
         with self._state_lock:
             self._state = self._state | values
             self._version += 1
 
     def add_marker(self, marker: tuple[float, str]) -> None:
-        """Add a marker, which consists of a Unix time, s, and a text, to the markers that the page shows."""
+        """Add a marker to the markers that the page shows. A marker consists of a Unix time (s) and a text."""
         earlier_markers = self._state.get("markers", [])
         self.update(markers=[*earlier_markers, tuple(marker)][-MAX_MARKERS:])  # JSON accepts no named tuple
 
@@ -190,9 +190,9 @@ class LivePage(Application):
         return json_response({})
 
     def _read(self, request: Read) -> dict[str, Any]:
-        """Return the samples that a browser does not have yet and, if it has changed, the state of the stream.
+        """Return the samples that a browser does not have yet, and the state of the stream if the state has changed.
 
-        Without a number of the first sample in the request, the samples of the last `HISTORY_S` seconds are returned.
+        If the request does not state the first sample, the samples of the last `HISTORY_S` seconds are returned.
         """
         tape = self.tape
         version = self._version

@@ -3,7 +3,7 @@
 The page shows the contact that a network estimates from the charges of the press. The page is a single file, which
 loads no other files. The file contains the scripts, the networks as compressed ONNX files, and the stress of the film
 as a series, from which `playground/charges.js` computes the charges. The playground can show the models of a biaxial
-film whose stress the series describes, and whose electrodes have four corners.
+film if the series describes the stress of this film, and if each electrode has four corners.
 """
 
 import base64

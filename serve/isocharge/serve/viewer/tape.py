@@ -1,4 +1,4 @@
-"""Samples of a stream, from which the live page draws, and the tape that stores them under consecutive numbers.
+"""Samples of a stream, which the live page draws, and the tape that stores the samples under consecutive numbers.
 
 A sample contains the numbers of a prediction record that the page shows. All numbers are stored in 64-bit
 floating-point format: the numbers of the record with the names `RECORD_NUMBERS`, the position of the other contact, the
@@ -54,8 +54,8 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
         record: The record.
         electrodes: Names of the electrodes, in the order of the charges.
     """
-    # If there is a tracked contact, its numbers replace those of the record. It has only some of the numbers: the
-    # position and the force, for example, but not the time. The others are those of the record.
+    # If there is a tracked contact, its numbers replace the numbers of the record. A tracked contact has only some of
+    # the numbers: the position and the force, for example, but not the time. The other numbers come from the record.
     contact = record.tracked or record
     values = [getattr(contact, name, getattr(record, name)) for name in RECORD_NUMBERS]
     other_position = (None, None) if record.other is None else (record.other.x_mm, record.other.y_mm)
@@ -104,7 +104,7 @@ def _coalesced_run(run: Samples) -> Samples:
 LIVE_SAMPLES = 1 << 14
 """Number of stored samples of a live stream.
 
-They cover 16 s at 1 kHz. A browser that falls further behind misses samples.
+The stored samples cover 16 s at 1 kHz. A browser that falls further behind misses samples.
 """
 
 HISTORY_S = 10.0
@@ -114,7 +114,7 @@ The frame rate of the board is computed over the same time span.
 """
 
 MAX_DRAWN_SAMPLES = 600
-"""Largest number of samples of a line on the page, which shows the response to one request or an overview."""
+"""Largest number of samples in a line on the page. A line shows the response to one request, or an overview."""
 
 
 class Tape:
@@ -173,7 +173,7 @@ class Tape:
         return self.timestamp(self.oldest), self.timestamp(self.total - 1)
 
     def extent(self) -> dict[str, Any]:
-        """Return a description of a complete recording, which a live stream does not have."""
+        """Return a description of a complete recording; empty for a live stream."""
         return {}
 
     def rate_Hz(self) -> float | None:
@@ -190,8 +190,8 @@ class RecordedTape(Tape):
     def append(self, values: tuple[float | None, ...]) -> None:
         """Append a sample. If the buffer is full, double its size first, so that no sample is replaced.
 
-        If the clock was set back, the time of the previous sample replaces an earlier time, so that the page can show
-        the recording up to each time.
+        If the clock was set back, a sample with an earlier time gets the time of the previous sample. The page can
+        therefore show the recording up to any time.
 
         Args:
             values: The numbers of the sample, in the order of the fields of the type `dtype`. None is stored as NaN.
