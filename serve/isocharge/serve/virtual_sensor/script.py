@@ -76,7 +76,7 @@ class VirtualScript(Settings, frozen=True):
     faults: Faults = Faults()
 
     def __post_init__(self) -> None:
-        """Check the times of the rows of `presses`, between which the presses are interpolated.
+        """Check the number and the times of the rows of `presses`, between which the presses are interpolated.
 
         Raises:
             WrongKey: If there is only one row, or the times do not increase.
@@ -99,13 +99,13 @@ class VirtualScript(Settings, frozen=True):
 
 
 def _interpolate(rows: Array, t_s: Array, rate_Hz: float, min_force_N: float = 0.0) -> Script:
-    """Return a script by linear interpolation between rows.
+    """Return a script whose contacts are interpolated linearly between rows.
 
     Args:
         rows: Rows (seconds, x_mm, y_mm, force_N), shape (n, 4), with increasing times.
         t_s: Time of each frame since the first row, shape (frames,), s.
         rate_Hz: Number of frames per second, Hz.
-        min_force_N: Smallest force while something touches, N.
+        min_force_N: Smallest force while something touches the film, N.
     """
     row_time_s, *columns = rows.T
     contact = np.column_stack([np.interp(t_s, row_time_s - row_time_s[0], column) for column in columns])

@@ -43,7 +43,7 @@ class PseudoPort:
     """An open pseudo-terminal in raw mode.
 
     Attributes:
-        url: Path of the device for the reader.
+        url: Path of the device that a reader opens.
     """
 
     def __init__(self) -> None:
@@ -148,15 +148,15 @@ class VirtualSensor:
         """Compute the charges of the script.
 
         Args:
-            charges: Forward map. It is called once, for the frames in which something touches.
+            charges: Forward map. The map is called once, for the frames in which something touches the film.
             script: The presses.
             noise: Amplifier. By default, the measured charges are the charges of the film.
-            offset_pC: Charge that is added to every frame, one for each electrode, pC. A reader measures it as its
-                tare. By default, the charges are drawn at random.
+            offset_pC: Charge of each electrode that is added to every frame, pC. A reader measures the added charges as
+                its tare. By default, the added charges are drawn at random.
             seed: Seed of noise, offset and faults.
             encode: Frame format.
             faults: Faults between the sensor and the reader; none by default.
-            link: Path of a symbolic link to the port, which exists while the context is active.
+            link: Path of a symbolic link to the port. The link exists while the context is active.
 
         Raises:
             SceneError: If the forward map returns charges of another shape, or charges that are not finite.
@@ -286,7 +286,7 @@ def _clean_charges(forward: Charges, script: Script) -> Array:
         script: Contacts of n frames.
 
     Returns:
-        Charges, shape (n, electrodes), pC; zero in frames in which nothing touches.
+        Charges, shape (n, electrodes), pC; zero in frames in which nothing touches the film.
 
     Raises:
         SceneError: If the forward map returns charges of another shape, or charges that are not finite.
