@@ -23,7 +23,8 @@ class Address:
     Attributes:
         host: Host name or IP address. At `::`, the server also accepts IPv4 clients, as a gRPC server does.
         port: TCP port. The port 0 selects a free port.
-        uds: Path of a Unix socket, to which only its owner can connect. If it is given, it replaces host and port.
+        uds: Path of a Unix socket, to which only its owner can connect. If the path is given, the socket replaces host
+            and port.
     """
 
     host: str = "127.0.0.1"
@@ -116,12 +117,12 @@ class ServerLimits:
         body_bytes: Largest size of the body of a request, bytes. The limit applies before and after the body is
             decompressed.
         header_bytes: Largest total size of the request line and the headers, bytes.
-        header_seconds: Longest time in which the headers of a request must arrive, s. It begins with the connection or
-            with the first byte of the request.
-        body_seconds: Longest time from the end of the headers to the end of the body, s. It is also the longest time in
-            which the client must read the response.
+        header_seconds: Longest time in which the headers of a request must arrive, s. The time begins with the
+            connection or with the first byte of the request.
+        body_seconds: Longest time from the end of the headers to the end of the body, s. The client must also read the
+            response within this time.
         idle_seconds: Longest time between two requests of a connection, s.
-        grace_seconds: Longest time to wait, when a server stops, until the requests that have begun are finished, s.
+        grace_seconds: Longest time for which a stopping server waits for the requests that have begun, s.
         connections: Largest number of open connections.
         connection_requests: Largest number of requests of a connection that wait for the response to an earlier request
             (HTTP), and of open calls of a connection (gRPC). HTTP/2 recommends at least 100.
@@ -138,13 +139,13 @@ class ServerLimits:
 
 
 def url_host(host: str) -> str:
-    """Return a host name or an address as it is written in a URL, where an IPv6 address is in square brackets."""
+    """Return a host name or an address in the form that a URL needs: an IPv6 address is put in square brackets."""
     return f"[{host}]" if ":" in host else host
 
 
 @lru_cache
 def ip_address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
-    """Parse the text of an IP address, and return None if the text is not an IP address."""
+    """Parse the text of an IP address, and return the address, or None if the text is not an IP address."""
     try:
         return ipaddress.ip_address(host)
     except ValueError:

@@ -1,6 +1,6 @@
 """Check of the access to a server: its token, and protection against requests from web pages of other sites.
 
-The class `AccessCheck` refuses a request if the server has a token and the request does not contain it. The class also
+If the server has a token, the class `AccessCheck` refuses requests that do not contain the token. The class also
 refuses requests from web pages of other sites.
 
 A page in a browser can send requests to every address that the browser can reach, including the loopback address. If
@@ -40,7 +40,7 @@ class AccessCheck:
     Args:
         host: Host name or address on which the server listens.
         allowed_hosts: Further host names of the server, for example the name of a reverse proxy. Pages of these hosts
-            may also send requests. A text is one name.
+            may also send requests. A single text is treated as one name.
         token: Token that requests must contain; None if requests need no token. With a token, every value of the header
             `Host` is accepted. DNS rebinding is then harmless, because a page of another site does not have the token.
         any_host: Whether to accept every value of the header `Host` even without a token. This is harmless if the
@@ -167,7 +167,7 @@ class AccessCheck:
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
-    """Return the value of each header by its name. If a header is repeated, its last value is returned.
+    """Return the value of each header by its name. If a header is repeated, the last value of the header is returned.
 
     Args:
         headers: Pairs of the name of a header in lower case and its value.

@@ -1,7 +1,7 @@
 """Metrics and log of the HTTP server and of the gRPC server.
 
 The objects of the package `prometheus_client` are the only counters. A request updates them in a few microseconds.
-Prometheus reads the counters, and so do the statistics of Triton's protocol.
+Prometheus and the statistics of Triton's protocol read the same counters.
 
 The log line of a request contains no text that a client has sent. The names of routes and statuses are defined by this
 server, and the address of the client comes from the operating system. A client therefore cannot forge a log line, fill
@@ -22,7 +22,7 @@ from isocharge.common.errors import package_version
 
 
 class Statistics(NamedTuple):
-    """Metrics of the inferences of one version of a model since the start of the server, or of all versions.
+    """Metrics of the inferences since the start of the server, for one version of a model or for all versions.
 
     Attributes:
         presses: Number of presses that were answered.
@@ -122,7 +122,7 @@ class Traffic:
     def __init__(self, log: RequestLog | None = None) -> None:
         """Create a registry with the metrics of a server that has not received any request.
 
-        Each metric adds itself to the registry that it is given.
+        Each metric adds itself to the registry, which is passed to the metric.
 
         Args:
             log: Log to which each request is written, or None if there is no log.

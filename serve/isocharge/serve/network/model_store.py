@@ -54,8 +54,8 @@ class Version(NamedTuple):
         name: Name of the model.
         number: Number of the version; 0 if the versions of the model are not known.
         loaded: The loaded version, or None if the version is not available for requests.
-        reason: Reason why the version was refused or unloaded, or an empty text. The new files of a loaded version may
-            be refused, too.
+        reason: Reason why the version was refused or unloaded, or an empty text. A loaded version also has a reason if
+            its new files were refused.
     """
 
     name: str
@@ -73,8 +73,8 @@ class ModelStore:
     def __init__(self, models: StrPath | None = None) -> None:
         """Load all versions of all models in one repository, or in all repositories that `find_model` searches.
 
-        If several repositories contain a model, the model in the first of them is used. The methods `load` and `index`
-        search the repositories again, so that new models are found.
+        If several repositories contain a model, the model in the first of these repositories is used. The methods
+        `load` and `index` search the repositories again, so that new models are found.
 
         Args:
             models: Folder of the only repository. By default, all repositories are searched.
@@ -128,13 +128,13 @@ class ModelStore:
         return [row.reason for row in self._find(name, version) if row.reason]
 
     def _find(self, name: str | None = None, version: str = "") -> list[Version]:
-        """Return the versions that `versions_of` returns, and those that are not loaded."""
+        """Return the versions that match the arguments of `versions_of`, whether or not they are loaded."""
         names = sorted(self._versions) if name is None else [name]
         rows = [row for name in names for row in self._versions.get(name, ())]
         return [row for row in rows if version in ("", str(row.number))]
 
     def index(self) -> list[dict[str, str]]:
-        """Return one row for every version that is loaded, was refused or was unloaded, and for every other model.
+        """Return one row for every version that is loaded, was refused or was unloaded, and for every model without one.
 
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
@@ -204,8 +204,8 @@ class ModelStore:
     def _load_versions(self, name: str, folder: Path | None) -> None:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
-        Earlier versions that are no longer in the folder are removed, unless a version is refused or the folder
-        contains no version.
+        Earlier versions that are no longer in the folder are removed. If a version is refused, or if the folder
+        contains no version, the earlier versions are kept.
 
         Args:
             name: Name of the model.

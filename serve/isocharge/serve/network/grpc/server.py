@@ -24,8 +24,8 @@ MIN_PING_MS = 5000
 async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
     """Return a context manager that runs a gRPC server in the present event loop until the `async with` block ends.
 
-    At the end of the block, the calls that have begun are finished, and grpcio cancels the calls that it has received,
-    but not begun. If the exit of the block is cancelled, all calls are ended at once.
+    At the end of the block, all calls that have begun are finished. grpcio cancels the calls that it has received but
+    not begun. If the exit of the block is cancelled, all calls are ended at once.
 
     Args:
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token

@@ -83,7 +83,8 @@ def write_response(content: Json, raw_contents: list[bytes]) -> Any:
 
     Args:
         content: Content of the HTTP response.
-        raw_contents: Binary tensors of all outputs. It is empty if the content itself contains their values.
+        raw_contents: Binary tensors of all outputs. The list is empty if the content itself contains the values of the
+            outputs.
     """
     for tensor in content["outputs"]:
         if raw_contents:
@@ -100,7 +101,7 @@ ROUTE_OF_METHOD = {name: route for route in ROUTES for name in route.rpcs}
 """Route of the HTTP server that gives the same answer, by the name of the gRPC method."""
 
 ANSWER_FIELDS = {"ModelConfig": "config", "RepositoryIndex": "models"}
-"""Field of the response that contains the answer, by the name of the method. Other responses are the answer itself."""
+"""Field of the response that contains the answer, by the name of the method. Any other response is the answer."""
 
 GRPC_STATUSES = {
     400: "INVALID_ARGUMENT",
@@ -111,7 +112,7 @@ GRPC_STATUSES = {
     429: "RESOURCE_EXHAUSTED",
     500: "INTERNAL",
 }
-"""Name of the gRPC status by the HTTP status with the same meaning."""
+"""Name of the gRPC status for each HTTP status with the same meaning."""
 
 TIMEOUT_MESSAGE = "the client sent or read nothing for too long, another call needed the place, or the server stopped"
 """Message to a client whose call has taken too long."""
@@ -140,7 +141,7 @@ class Service:
     async def handle(self, name: str, _messages: object, context: ServicerContext) -> None:
         """Answer a call of a client, count the call by its status, and log the call if there is a log.
 
-        If an error occurs, the client receives its status and its message.
+        If an error occurs, the client receives the status and the message of the error.
 
         Args:
             name: Name of the method.
@@ -176,8 +177,8 @@ class Service:
 
         A call of the method `STREAM_METHOD` may contain any number of messages, and every other call contains one
         message. The first message must arrive within `header_seconds`, and each later message within `idle_seconds`
-        after the previous response. The client must read each response within `body_seconds`. If the server is to stop,
-        no message is read after the present one.
+        after the previous response. The client must read each response within `body_seconds`. If the server has been
+        told to stop, no message is read after the present message.
 
         Args:
             name: Name of the method.
@@ -284,7 +285,7 @@ class Service:
     def end_streams(self) -> None:
         """End the calls that wait for a message, because the server stops.
 
-        The calls have another 0.1 s, because a client may have sent a message that has not been read yet.
+        The calls stay open for another 0.1 s, because a client may have sent a message that has not been read yet.
         """
         self._is_stopping = True
         deadline = asyncio.get_running_loop().time() + 0.1

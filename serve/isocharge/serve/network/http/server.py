@@ -53,7 +53,7 @@ class Connection(HttpToolsProtocol):
         self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
 
     def _allow(self, seconds: float) -> None:
-        """Set the time that the client has from now on to send further data, s."""
+        """Set the deadline for further data from the client to the present time plus `seconds`."""
         self.deadline = self.loop.time() + seconds
 
     def connection_made(self, transport: Any) -> None:
@@ -83,8 +83,8 @@ class Connection(HttpToolsProtocol):
     def data_received(self, data: bytes) -> None:
         """Parse data of the client in pieces. Refuse a request whose head, trailers or chunk extensions are too long.
 
-        The bytes are counted from the end of the previous request. If a piece of the data contains this end, the
-        beginning of the next head in the same piece is not counted, so that such a head may be twice as long.
+        The bytes are counted from the end of the previous request. If a piece of the data contains this end and the
+        beginning of the next head, this beginning is not counted. Such a head may therefore be twice as long.
         """
         limit = self._limits.header_bytes
         while data and not self.transport.is_closing():
@@ -167,10 +167,11 @@ class Connection(HttpToolsProtocol):
             self.transport.abort()
 
     def shutdown(self) -> None:
-        """Let the response to the open request close the connection. uvicorn calls this method when the server stops.
+        """Close the connection after the response to the open request. uvicorn calls this method when the server stops.
 
         A connection without an open request stays open for another 0.1 s, because its client may have sent a request
-        that has not been read yet. The connection is then ended without waiting for the client, which TLS would do.
+        that has not been read yet. The connection is then ended without waiting for the client. A normal end of a TLS
+        connection would wait for the client.
         """
         if not self.is_idle or self.transport.get_write_buffer_size() > 0:
             super().shutdown()
@@ -181,7 +182,7 @@ class Connection(HttpToolsProtocol):
             self.loop.call_later(0.1, self.shutdown)
 
     def _close_after_responses(self) -> bool:
-        """Let the response to the latest complete request close the connection.
+        """Close the connection after the response to the latest complete request.
 
         Returns:
             Whether a complete request is not answered yet.
@@ -199,10 +200,11 @@ class Connection(HttpToolsProtocol):
         self.refuse(400, msg)
 
     def refuse(self, status: int, message: str) -> None:
-        """Send a refusal as the last response of the connection, and count it.
+        """Send a refusal as the last response of the connection, and count the refusal.
 
         If earlier, complete requests are not answered yet, the connection is closed after their responses, and the
-        refusal is neither sent nor counted. The same holds for the rest of a request that is already answered.
+        refusal is neither sent nor counted. If the refused data are the rest of a request that is already answered, the
+        refusal is not sent or counted either.
 
         Args:
             status: HTTP status.
@@ -222,11 +224,11 @@ class Connection(HttpToolsProtocol):
 
 
 def _raise_file_limit(limits: ServerLimits) -> ServerLimits:
-    """Let the process open as many files as the system permits, and return the limits that the server then can keep.
+    """Let the process open as many files as the system permits, and return the limits that the server can then keep.
 
     Each connection needs an open file. The number of connections is reduced if it exceeds seven eighths of the number
-    of files. The remaining files are free, because a server without a free file could not accept a connection, nor end
-    another connection for it.
+    of files. The remaining files are kept free. A server without a free file could not accept a new connection, and
+    could not end another connection in its favour.
 
     Args:
         limits: Requested limits of the server.
@@ -254,8 +256,8 @@ class HttpServer(uvicorn.Server):
         """Open the socket on which the server listens.
 
         Args:
-            application: ASGI application that answers the requests. Its limits are also those of the connections. Its
-                counters also count refused requests and open connections.
+            application: ASGI application that answers the requests. The limits of the application also apply to the
+                connections. The counters of the application also count refused requests and open connections.
             address: Address on which to listen.
             tls: Certificate and private key for TLS, or None for a server without TLS.
 
@@ -303,7 +305,7 @@ class HttpServer(uvicorn.Server):
         uvloop.run(serve())
 
     def stop(self) -> None:
-        """End the method `run` as soon as the open requests are finished or, if called again, without finishing them.
+        """End the method `run` after the open requests are finished. A second call ends `run` without finishing them.
 
         Any thread and any signal handler may call this method.
         """

@@ -53,8 +53,8 @@ class Application(ABC):
     async def __call__(self, scope: Message, receive: Channel, send: Channel) -> None:
         """Answer one HTTP request. If the client disconnects before its request is complete, nothing is sent.
 
-        WebSockets are refused. The start and the end of the program need no work (lifespan of ASGI). A server that
-        stops cancels requests that it cannot finish in time, and their clients receive the status 503.
+        WebSockets are refused. No work is needed at the start and at the end of the program (lifespan of ASGI). A
+        server that stops cancels requests that it cannot finish in time, and their clients receive the status 503.
 
         Args:
             scope: Method, path, headers and client of the request.
@@ -86,9 +86,10 @@ class Application(ABC):
         await send({"type": "http.response.body", "body": response.body})
 
     async def _read_body(self, receive: Channel) -> bytes | None:
-        """Receive the body of a request, and return it, or None if the client disconnects before its end.
+        """Return the body of a request, or None if the client disconnects before the end of the body.
 
-        If the body is larger than allowed, its rest is not received. The method `answer` then refuses the request.
+        If the body is larger than allowed, the rest of the body is not received. The method `answer` then refuses the
+        request.
 
         Args:
             receive: Function that returns the next part of the request.
@@ -113,7 +114,8 @@ class Application(ABC):
             client: Address and port of the client, for the log.
 
         Returns:
-            The response. If an error occurs, it is not raised, but the response contains its status and its message.
+            The response. If an error occurs, the error is not raised. The response then contains the status and the
+            message of the error.
         """
         start_ns = time.perf_counter_ns()
         limit = self.limits.body_bytes
@@ -128,7 +130,7 @@ class Application(ABC):
         return response
 
     def _route_name(self, path: str) -> str:  # noqa: ARG002
-        """Return the name under which a request is counted and logged. By default, it is the same for all requests."""
+        """Return the name under which a request is counted and logged. By default, all requests have the same name."""
         return "page"
 
     @abstractmethod
@@ -162,7 +164,7 @@ _PATTERNS = [
     (re.compile(route.path.format(model="(?P<name>[^/]*)", version="(/versions/(?P<version>[^/]+))?")), route)
     for route in ROUTES
 ]
-"""Regular expression of the path of each route. Templates of paths contain no special characters but the point."""
+"""Regular expression of the path of each route. The point is the only special character in templates."""
 
 
 @lru_cache

@@ -72,7 +72,7 @@ This output is only computed if the client requests it.
 """
 
 MODEL_OUTPUTS = [OutputTensor(name) for name in OUTPUTS]  # type: ignore[arg-type]
-"""Outputs of a request that lists no outputs."""
+"""Outputs that are computed for a request that lists no outputs."""
 
 
 def read_infer(body: bytes, header_length: bytes) -> tuple[InferBody, bytes]:
@@ -142,13 +142,13 @@ def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, 
 
     Args:
         loaded: Version of the model that is run.
-        body: Content of the request. If it lists no outputs, the outputs of the model are returned.
+        body: Content of the request. If the content lists no outputs, the outputs of the model are returned.
         binary: Binary tensor with the charges, which is empty if the content contains the charges.
 
     Returns:
         The content of the response, in the form of the JSON object of an HTTP response, and the binary tensors of the
-        response. Each output has its values either in a binary tensor, or under the key `data`: an array of numbers,
-        or a list of texts for the output `flags`.
+        response. The values of each output are either in a binary tensor or under the key `data`. The key `data`
+        contains an array of numbers or, for the output `flags`, a list of texts.
 
     Raises:
         IsochargeError: If the request does not fit the model, or if the model fails.
@@ -182,7 +182,7 @@ def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, 
 
 
 def _take_binary_tensor(tensor: Json) -> bytes:
-    """Replace the values in the object that describes an output by their size, and return them as a binary tensor.
+    """Remove the values of an output from its JSON object, add their size, and return the values as a binary tensor.
 
     In a binary tensor, numbers are little-endian float32. Each text is preceded by its length in bytes, a 32-bit
     unsigned integer.

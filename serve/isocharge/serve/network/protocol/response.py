@@ -1,4 +1,4 @@
-"""HTTP responses, decompression of requests, and messages of errors for HTTP and gRPC."""
+"""HTTP responses, decompression of requests, and error messages for HTTP and gRPC."""
 
 import logging
 import zlib

@@ -61,7 +61,7 @@ class Route(NamedTuple):
         method: HTTP method. A route with the method GET also answers HEAD requests, without a body.
         path: Template of the path. `{model}` stands for the name of a model, and `{version}` for the part
             `/versions/NUMBER`, which may be missing.
-        respond: Function that answers a request by a response, or by the content of a JSON response.
+        respond: Function that receives a request, and returns a response or the content of a JSON response.
         rpcs: Names of the gRPC methods that give the same answer.
         needs_token: Whether requests must contain the token of the server. Health checks need no token, because the
             programs that start and monitor servers do not have it.
