@@ -1,8 +1,8 @@
 """Types of the NumPy arrays in the signatures of functions, and the reader for npz files of untrusted sources.
 
 An npz file is a zip archive with one entry in NumPy's npy format for each array. The sizes and the compression methods
-that the archive declares are checked before NumPy reads any array. A small file can therefore not cause the allocation
-of much memory. Arrays that contain pickled Python objects are refused.
+that the archive declares are checked before NumPy reads any array. A small file therefore cannot occupy much memory.
+Arrays that contain pickled Python objects are refused.
 """
 
 import io

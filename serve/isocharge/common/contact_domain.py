@@ -10,7 +10,7 @@ from isocharge.common.errors import SceneError
 MIN_LOG_FORCE_HALF_WIDTH = 0.05
 """Smallest half width of a domain in ln F, dimensionless.
 
-If a domain contains a single force, its half width would be zero, and contacts could not be scaled by it.
+Without this limit, a domain with a single force would have the half width zero, and contacts could not be scaled.
 """
 
 LIMIT_TOLERANCE = 1.0 + 1e-9

@@ -20,7 +20,7 @@ DEFAULT_STRESS_LIMIT = 45.0
 """Largest stress of a film under a probe, MPa. Drawn PVDF yields at 45 to 55 MPa."""
 
 MAX_BATCH = 4096
-"""Largest number of presses in one request or in a batch of Triton. The graph of a model has no limit."""
+"""Largest number of presses in one request or in a batch of Triton. The graph of a model has no such limit."""
 
 FEW_ELECTRODES = 4
 """Largest number of electrodes for which a small training set and a small network are sufficient. With more electrodes,

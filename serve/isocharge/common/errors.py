@@ -1,4 +1,4 @@
-"""The exceptions of isocharge, the printable text of their messages, and imports whose failure gives advice.
+"""The exceptions of isocharge, printable text for their messages, and imports that give advice if they fail.
 
 Each exception also inherits from the built-in exception with the most similar meaning. A message states what was
 expected, what was given, where the error is, and what the user can do. `isocharge.cli.main` maps the exceptions to exit
@@ -9,10 +9,10 @@ executes or hides. Examples are escape sequences that move the cursor or change 
 reverse the direction of writing, and characters without width. `printable` replaces such characters by the escape
 sequences that JSON uses, such as `\\u001b`. A text in JSON therefore remains valid JSON.
 
-If a package is not installed, an import within `require` fails with the command that installs the missing extra. The
-names of `lazy_names` are imported when they are used. A program that reads a dataset therefore does not wait for the
-import of the solver, a calibration does not wait for PyTorch, and a program that predicts contacts does not wait for
-the servers and the parsers of boards.
+If a package is not installed, an import within `require` raises an error that states the command for installing the
+missing extra. The names of `lazy_names` are imported only when a program uses them. A program that reads a dataset
+therefore does not wait for the import of the solver, a calibration does not wait for PyTorch, and a program that
+predicts contacts does not wait for the servers and the parsers of boards.
 """
 
 import ast
@@ -174,7 +174,7 @@ class ListenError(IsochargeError, OSError):
 
 
 class OutputExists(IsochargeError, FileExistsError):
-    """An output file or folder exists already. It is not overwritten."""
+    """An output file or folder exists already. The existing file or folder is not overwritten."""
 
 
 class OutputError(IsochargeError, OSError):
@@ -214,7 +214,7 @@ class TareError(IsochargeError, RuntimeError):
 
 
 class PluginError(IsochargeError, RuntimeError):
-    """An output or a source, such as that of another package, cannot be used, or has failed."""
+    """An output or a source, for example from another package, cannot be used or has failed."""
 
 
 class MissingExtra(IsochargeError, ImportError):
@@ -330,7 +330,7 @@ def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callab
     public_names = sorted(module_by_name)
 
     def import_public_name(name: str) -> Any:
-        """Import a public name, and store it in the package, so that Python no longer calls this function for it.
+        """Import a public name, and store it in the package. Python then does not call this function for it again.
 
         Raises:
             AttributeError: If the name is not public.

@@ -1,6 +1,6 @@
 """Reading and writing of files and folders.
 
-A file or folder that is written appears under its name only when it is complete.
+A new file or folder appears under its final name only when it is complete.
 """
 
 import errno
@@ -89,7 +89,7 @@ def check_new_output(path: Path) -> None:
     """Check that an output can be created: nothing exists at its path, and the folder of the path is writable.
 
     Raises:
-        OutputExists: If the path exists, also as a link to a path that does not exist.
+        OutputExists: If the path exists, even if it is only a link to a path that does not exist.
         OutputError: If the nearest existing folder above the path is not writable.
     """
     if os.path.lexists(path):
@@ -100,7 +100,7 @@ def check_new_output(path: Path) -> None:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under a temporary name, flush the file to disk, and rename it.
+    """Write a file under a temporary name, flush the file to disk, and rename the file.
 
     A program that reads the file therefore reads either the complete old content or the complete new content.
 

@@ -21,7 +21,7 @@ _listener: ContextVar[Listener | None] = ContextVar("progress", default=None)
 
 @contextmanager
 def listening(listener: Listener) -> Iterator[None]:
-    """During the `with` block, pass the progress that the present thread reports to a listener.
+    """Pass the progress reports of the present thread to a listener during the `with` block.
 
     Args:
         listener: Function that is called with the arguments of `report` for each report.
@@ -61,8 +61,9 @@ def second_thread(shown_title: str | None = None) -> Iterator[Executor]:
     not started are cancelled. The running call ends with a `CancelledError` when it next reports its progress.
 
     Args:
-        shown_title: Title that replaces the titles of all reports of the thread; None for their own titles. A title
-            identifies a progress bar, so two computations that run at the same time need different titles.
+        shown_title: Title that replaces the titles of all reports of the thread; None if the reports keep their own
+            titles. A title identifies a progress bar, so two computations that run at the same time need different
+            titles.
 
     Yields:
         The executor.
@@ -95,7 +96,7 @@ def track(items: Iterable[Item], title: str, total: int | None = None) -> Iterat
     Args:
         items: The items that the caller processes.
         title: Title of the computation for the user, such as "solving the film".
-        total: Number of items. It may be None if `items` has a length.
+        total: Number of items. If `items` has a length, the number may be None.
     """
     count = len(items) if total is None else total  # type: ignore[arg-type]
     for done, item in enumerate(items, start=1):

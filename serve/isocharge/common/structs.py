@@ -77,7 +77,7 @@ class WrongKey(ValueError):
     """
 
     def __init__(self, key: str, expected: str = "", got: object = None) -> None:
-        """Create the error. Its message states the expected and the given value, or is empty if the key is missing."""
+        """Create the error. The message states the expected value and the given value; empty if the key is missing."""
         super().__init__(f"expected {expected}, got {shown(got)}" if expected else "")
         self.key = key
 
@@ -209,7 +209,8 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     Args:
         value: Value from TOML or JSON.
         expected_type: Type to which the value cannot be converted.
-        error: Exception of msgspec. If `__post_init__` of a struct has raised a `WrongKey`, it is the cause of `error`.
+        error: Exception of msgspec. If `__post_init__` of a struct has raised a `WrongKey`, this `WrongKey` is the
+            cause of `error`.
         path: Names of the keys that lead to the value; empty for the whole content.
     """
     item_types = _item_types(value, expected_type)
@@ -273,10 +274,10 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
 
 
 def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int, Any]:
-    """Return the types of the keys that a table may have, if the keys are declared by structs.
+    """Return the types of the values that a table may have, by their keys, if structs declare these keys.
 
-    A struct declares the keys of the table if it has no tag, or if the table contains its tag. The tag key may have the
-    tag of any of the structs.
+    A struct declares the keys of the table if it has no tag, or if the table contains its tag. The value of the tag key
+    may be the tag of any of the structs.
 
     Args:
         table: Table from TOML or JSON.
@@ -326,7 +327,7 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
 
     Args:
         schema: JSON schema that msgspec has derived from a type. If the annotation of the type contains a description,
-            the schema contains this description, and the function returns it.
+            the schema contains this description, and the function returns this description.
     """
     match schema:
         case {"description": description}:

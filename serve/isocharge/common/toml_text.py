@@ -1,8 +1,8 @@
 """Writing of settings as TOML. The module `isocharge.common.structs` reads TOML.
 
 The module uses no library that writes TOML. The library tomli-w cannot write comments, and writes each number of a list
-on a separate line. The library rtoml makes a section of each table inside a section, so that lines which a user appends
-to a section would belong to another table. The library tomlkit is intended for changes of existing files.
+on a separate line. The library rtoml writes a table inside a section as another section. Lines that a user appends to
+the first section would then belong to another table. The library tomlkit is intended for changes of existing files.
 """
 
 import json
@@ -77,6 +77,6 @@ def _value(value: object) -> str:
 def _json(value: bool | str) -> str:
     """Return a truth value or a text in the notation of JSON, which is also valid in TOML.
 
-    The only difference is that the character U+007F must be escaped in TOML.
+    The only difference between the two notations is that TOML requires an escape sequence for the character U+007F.
     """
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
