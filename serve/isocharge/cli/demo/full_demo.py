@@ -80,8 +80,7 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor) -> Array:
         predictor: The model that estimates the contacts.
 
     Returns:
-        The frames in which both the virtual sensor and the model have a contact, shape (n, 2, 3): the true and the
-        estimated (x, y, F), mm and N.
+        The true and the estimated contact (x, y, F) of each frame in which both exist, shape (n, 2, 3), mm and N.
     """
     touch = TouchStream(predictor)
     followed = []
@@ -106,7 +105,7 @@ def draw_page(forward_map: ForwardMap, equilibrium: Equilibrium, followed: Array
         forward_map: Forward map of the film.
         equilibrium: The press whose deflection is drawn.
         followed: True and estimated contacts of the live part, shape (n, 2, 3), mm and N.
-        path: Path of the picture, which is written.
+        path: Path to which the picture is written.
     """
     figure = new_figure(15.0, 9.2)
     top, bottom = cast(np.ndarray, figure.subfigures(2, 1))

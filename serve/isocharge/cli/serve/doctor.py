@@ -149,8 +149,8 @@ def _electrodes_of(model: str | None, models: Path | None) -> tuple[str, ...]:
     """Return the names of the electrodes for which the channels of a board are searched.
 
     Args:
-        model: Value of `--model`: a model, a sensor file if the film has no model yet, or None. Without a value, no
-            names are returned, and any names are accepted.
+        model: Value of `--model`: a model, a sensor file if the film has no model yet, or None. If the value is None,
+            no names are returned, and the board may use any names.
         models: Value of `--models`.
     """
     if not model:
@@ -169,7 +169,7 @@ def _check_wiring(examination: Examination) -> ElectrodeCheck:
         examination: Result of the port check, with the device file and the channels of the board.
 
     Raises:
-        PressCheckError: If a press does not come, or the presses do not distinguish the channels.
+        PressCheckError: If an expected press is not made, or the presses do not distinguish the channels.
     """
     table = dict(examination.device)
     if examination.unit != "pC":
@@ -238,7 +238,7 @@ def device_text(examination: Examination) -> str:
 
 
 def brief_report(examination: Examination) -> dict[str, Any]:
-    """Return the report on a port without the device file, and with the unit of the channels in the names of values.
+    """Return the report on a port without the device file. The names of values contain the unit of the channels.
 
     Args:
         examination: Result of the port check.

@@ -113,7 +113,7 @@ def _load_all(store: ModelStore) -> None:
 
 @contextmanager
 def _traffic(log_format: str) -> Iterator[Traffic]:
-    """Yield the traffic counters of the servers, and write a log of requests for `--log json` (context manager).
+    """Context manager that yields the traffic counters of the servers and, for `--log json`, writes a log of requests.
 
     A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
     of all packages are written to the same log. For `--log text`, there is no log.
@@ -138,7 +138,7 @@ def _traffic(log_format: str) -> Iterator[Traffic]:
 async def _announced(
     server: HttpServer, handler: Handler, host: str, grpc_port: int | None, tls: Tls | None
 ) -> AsyncIterator[None]:
-    """Print the address of the HTTP server, run the gRPC server, and print its address, too (context manager).
+    """Context manager that runs the gRPC server, and prints the addresses of the HTTP server and of the gRPC server.
 
     Args:
         server: The HTTP server.

@@ -61,7 +61,7 @@ def recorded_samples(recording: Recording, where: str) -> Samples:
 
 
 def recording_picture(samples: Samples, title: str) -> Figure:
-    """Draw the picture of a recording. Each value is a point, so that a time without records remains empty.
+    """Return a picture of a recording. Each value is drawn as a point, so that a time without records remains empty.
 
     Args:
         samples: Samples of the records, as `recorded_samples` returns them.

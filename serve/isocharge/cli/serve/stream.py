@@ -77,11 +77,11 @@ OutputOption = Annotated[
 
 
 def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callable[[PredictionRecord], object]]) -> None:
-    """Pass each record to all writers, and print each new tare, or the last charges if the stream ends without a tare.
+    """Pass records to all writers, and print each new tare. If the stream ends without a tare, print the last charges.
 
     Args:
         records: The records.
-        writers: Functions that write a record, which are called in their order.
+        writers: Functions that write a record. The functions are called in the given order.
     """
     is_tare_printed = False
     untared_pC: Mapping[str, float | None] | None = None  # latest charges while the tare is measured, otherwise None
@@ -137,7 +137,7 @@ def command_outputs(targets: Sequence[str] | None, touch: TouchStream, *, is_liv
         is_live: Whether the records come from a sensor.
 
     Raises:
-        InputError: If a target has none of the forms, or two targets write to standard output.
+        InputError: If no kind of output accepts a target, or two targets write to standard output.
     """
     context = OutputContext(
         electrodes=touch.predictor.metadata.electrodes,
@@ -152,8 +152,8 @@ def say_missing_records(outputs: Outputs, state: str) -> None:
     """Print how many records are missing in each output. The outputs must have been closed.
 
     Args:
-        outputs: The outputs. `not_written` contains the number of missing records of each incomplete output by its
-            target; None if this number is unknown.
+        outputs: The outputs. For each incomplete output, `not_written` contains the number of missing records, or None
+            if this number is unknown.
         state: Text that is printed for an output whose number of missing records is unknown.
     """
     for target, missing_records in outputs.not_written.items():

@@ -72,7 +72,7 @@ def sweep_radius(
         probes: The probes.
         force: Smallest and largest force, N.
         executor: Executor that runs the solves; None for this process.
-        noise: Noise with which the working area is determined; None for `reference`.
+        noise: Noise with which the working area is determined; None for the noise level `reference`.
 
     Raises:
         InputError: If the text is neither a number nor `auto`, or there is no working area with this noise.

@@ -20,9 +20,10 @@ def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
 
     Args:
         summary: Summary of the group.
-        summaries: One sentence for each command, by the function of the command in the notation of entry points, such
-            as "train.export_c:export_c_command [train]" for a module in the folder `cli`. The function defines the name
-            of the command, `export-c`. The extra of pyproject.toml, `train`, is the one that the command always needs.
+        summaries: One sentence for each command. Each key names the function of a command in the notation of entry
+            points, such as "train.export_c:export_c_command [train]" for a module in the folder `cli`. The name of the
+            function determines the name of the command, here `export-c`. The command always needs the extra of
+            pyproject.toml in square brackets, here `train`.
     """
     functions = {path.partition(":")[2].partition("_command")[0].replace("_", "-"): path for path in summaries}
 
@@ -32,7 +33,7 @@ def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
         """A group that stores only the names and the summaries of its commands."""
 
         def __init__(self, **settings: Any) -> None:
-            """Add a placeholder for each command, which has the summary of the command as its help."""
+            """Add a placeholder for each command. The help of the placeholder is the summary of the command."""
             super().__init__(**settings)
             for name, path in functions.items():
                 self.add_command(TyperCommand(name, help=summaries[path], short_help=summaries[path]))

@@ -1,4 +1,4 @@
-"""Options of commands for the live page, and the exchange of messages between a stream and its page."""
+"""Command options for the live page, and the exchange of messages between a stream and its page."""
 
 import logging
 import os
@@ -177,10 +177,10 @@ class PageFeed:
         Args:
             page: The page.
             touch: The stream whose records are passed to the page.
-            stream: The same stream together with its recording, which the page can, for example, tare; None for a
-                replay, which cannot be controlled.
-            new_recorder: Function that creates a recorder from the path of the recording and the label of the model,
-                when the page begins a recording. If it is None, the page cannot begin a recording.
+            stream: The same stream together with its recording. The page controls this stream, for example to measure a
+                new tare. None for a replay, which cannot be controlled.
+            new_recorder: Function that creates a recorder from the path of the recording and the label of the model.
+                The function is called when the page begins a recording. None if the page cannot begin a recording.
         """
         self._page = page
         self._touch = touch
@@ -221,7 +221,8 @@ class PageFeed:
         """Carry out a request of the page to write a marker, to begin or end a recording, or to measure a new tare.
 
         Raises:
-            InputError: If the page requests a recording while the stream is recorded, also for another browser.
+            InputError: If the page requests a recording while the stream is already recorded, even if another browser
+                has begun the recording.
             OutputError: If the file of the recording cannot be created.
         """
         from isocharge.serve.viewer.live_page import Marker, Tare

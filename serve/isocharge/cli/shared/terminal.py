@@ -54,7 +54,7 @@ def discard_output(descriptor: int) -> None:
 
 
 def show(text: str) -> None:
-    """Print a result as text on stdout, in which all characters that are not printable are escaped."""
+    """Print a result as text on stdout. All characters that are not printable are escaped."""
     typer.echo(printable_lines(text))
 
 
@@ -68,9 +68,9 @@ def show_json(value: Any) -> None:
 def show_result(result: Mapping[str, Any], *, json: bool = False) -> None:
     """Print a result on stdout, either as one line of JSON, or as text with the same names and values.
 
-    In the text, each value, each item of a dictionary and each of several sentences has a line. A list or a dictionary
-    of dictionaries is a table. Numbers are rounded to five significant digits. A number that is unknown or not finite
-    is printed as a dash.
+    In the text, each value, each item of a dictionary and each of several sentences has its own line. A list of
+    dictionaries, or a dictionary of dictionaries, is printed as a table. Numbers are rounded to five significant
+    digits. A number that is unknown or not finite is printed as a dash.
 
     Args:
         result: Values by their names, which contain the units. The dictionaries of a table have the same keys.
@@ -93,7 +93,7 @@ def show_result(result: Mapping[str, Any], *, json: bool = False) -> None:
 
 
 def _table_rows(value: Any) -> list[dict[str, Any]]:
-    """Return the rows of a table if a value is a list or a dictionary of dictionaries, and no rows otherwise.
+    """Return the table rows of a list of dictionaries or of a dictionary of dictionaries. Other values have no rows.
 
     The keys of a dictionary of dictionaries become the first column, which has no name.
     """
@@ -171,7 +171,7 @@ def _write_all(descriptor: int, data: bytes) -> None:
 
 @contextmanager
 def until_stopped() -> Iterator[None]:
-    """Context manager whose block runs until it ends or until the command is stopped. A stop is not an error.
+    """Context manager that ends its block without an error if the command is stopped.
 
     Three events stop the block: Ctrl-C, the signal SIGTERM, and a reader of stdout that closes its end of the pipe.
     """
@@ -218,7 +218,7 @@ def stop_timer(seconds: float | None, has_expired: Event) -> Iterator[None]:
 
 
 def unless_hung_up(act: Callable[[], object]) -> Callable[[], object]:
-    """Return a handler of SIGHUP that calls `act`, or stops the command as Ctrl-C does if its terminal has been closed.
+    """Return a handler of SIGHUP that calls `act`. If the terminal has been closed, the handler stops the command.
 
     The user sends SIGHUP to request the action. The system sends the same signal when the terminal is closed. If a
     standard stream that was a terminal at the start of the command is not a terminal any more, the terminal has been
@@ -236,7 +236,7 @@ PROGRESS_LINE_INTERVAL_S = 5.0
 
 
 def say(message: str, *, err: bool = True) -> None:
-    """Print a message, in which all characters that are not printable are escaped.
+    """Print a message. All characters that are not printable are escaped.
 
     The command continues if the stream is full or closed.
 
@@ -263,7 +263,7 @@ def warnings_to_stderr() -> Iterator[None]:
     """
 
     def print_warning(record: logging.LogRecord) -> None:
-        """Print a warning. The warnings of a running service have no word in front of them."""
+        """Print a warning. The warnings of a running service do not begin with `caution:`."""
         caution = "" if record.name.startswith("isocharge.serve") else "caution: "
         say(caution + record.getMessage())
 
@@ -273,7 +273,7 @@ def warnings_to_stderr() -> Iterator[None]:
 
 @contextmanager
 def warnings_passed_to(write: Callable[[logging.LogRecord], None], package: str) -> Iterator[None]:
-    """Context manager that calls a function with each warning of a package and of the packages in it."""
+    """Context manager that calls a function with each warning of a package and of its subpackages."""
     handler = logging.Handler()
     handler.emit = write  # type: ignore[method-assign, assignment]
     logger = logging.getLogger(package)
@@ -304,7 +304,7 @@ def shown_progress() -> Iterator[None]:
 
         @cache
         def bar_of(title: str) -> TaskID:
-            """Return the bar with the given title, which the first call creates."""
+            """Return the bar with the given title. The first call with a title creates the bar."""
             return bars.add_task(title, total=None, note="")
 
         def update_bar(title: str, done: int, total: int, note: str) -> None:

@@ -27,7 +27,7 @@ def random_script(forward_map: ForwardMap, rate_Hz: float, max_force_N: float, r
     Args:
         forward_map: Forward map. The presses stay within its area and its range of forces.
         rate_Hz: Frames per second, Hz.
-        max_force_N: Largest force, N. It is reduced to the largest force of the forward map if necessary.
+        max_force_N: Largest force, N. If necessary, this force is reduced to the largest force of the forward map.
         rest_s: Time before the first press, s.
     """
     min_force_N, max_map_force_N = forward_map.domain.force_range
@@ -50,7 +50,7 @@ def film_charges(forward_map: ForwardMap) -> Charges:
     min_force_N = forward_map.domain.force_range[0]
 
     def charges(contact: Array) -> Array:
-        """Compute the charges at forces of the map, and scale them down to smaller forces."""
+        """Compute the charges within the forces of the map, and scale the charges down for smaller forces."""
         x_mm, y_mm, force_N = contact.T
         map_force_N = force_N.clip(min=min_force_N)
         map_charge_pC = forward_map.charges(np.column_stack([x_mm, y_mm, map_force_N]))
