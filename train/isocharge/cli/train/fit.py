@@ -136,10 +136,10 @@ def _refuse_options(context: typer.Context, source: str, *used_options: str) -> 
     Args:
         context: The command with its arguments.
         source: Description of the presses, for the error message.
-        *used_options: Parameters of the command that have an effect.
+        *used_options: Parameters of the command that have an effect on the presses.
 
     Raises:
-        InputError: If an option is given that has no effect.
+        InputError: If an option without an effect is given.
     """
     without_effect = {"probe", "radius", "position_std_mm", "force_std"} - {*used_options}
     for parameter in context.command.params:
@@ -153,10 +153,10 @@ def _refuse_settings(path: Path | None, config: FitConfig) -> None:
 
     Args:
         path: The file; None for the default settings.
-        config: Its settings.
+        config: Settings from the file, or the default settings.
 
     Raises:
-        InputError: If there is such a setting.
+        InputError: If the file contains a setting without an effect.
     """
     for setting in ("noise", "hold_out"):
         if getattr(config.training, setting) != getattr(TrainingConfig(), setting):

@@ -167,7 +167,7 @@ def _read_earlier_session(path: Path, electrodes: tuple[str, ...], stds: dict[st
         The presses of the earlier session; None if there is no file.
 
     Raises:
-        PressError: If the file is not that of a session.
+        PressError: If the file is not the file of a session.
         OutputError: If a file cannot be written.
     """
     if path.is_file():
@@ -186,7 +186,7 @@ def _read_earlier_session(path: Path, electrodes: tuple[str, ...], stds: dict[st
 
 
 def _save(path: Path, presses: MeasuredPresses) -> None:
-    """Replace the file of a session, or delete it if there are no presses."""
+    """Replace the file of a session. If there are no presses, delete the file."""
     if len(presses):
         write_presses(path, presses)
         return

@@ -3,8 +3,8 @@
 If a machine makes the presses of a list, nothing is proposed or asked, and the presses are recorded in the order of the
 list.
 
-A session has two sources of events, the readings of a port and the lines of the keyboard, which are merged into one
-sequence.
+A session has two sources of events: the readings of a port and the lines of the keyboard. The events of both sources
+are merged into one sequence.
 """
 
 import threading
@@ -145,7 +145,7 @@ class Dialogue:
         self._shown_phase = ""  # instruction that was printed last for the present press
 
     def _say_phase(self, watched: WatchResult) -> None:
-        """Print the instruction of the present phase and its reason, unless this instruction was the last one printed.
+        """Print the instruction and the reason of the present phase, unless the same instruction was printed last.
 
         In a phase without an instruction, for example the phase of a steady press, nothing is printed.
         """
@@ -177,8 +177,8 @@ class Dialogue:
         """Record the presses that a machine makes, in the order of its list.
 
         Args:
-            contacts: Presses (x, y, F) of the list, shape (n, 3), mm and N; unknown values are NaN. The rows up to the
-                last press of the session were pressed earlier, and are not expected again.
+            contacts: Presses (x, y, F) of the list, shape (n, 3), mm and N; unknown values are NaN. The presses in the
+                rows up to the last press of the session were made earlier, and are not expected again.
 
         Raises:
             PortLost: If the port is lost, because it is then unknown which press comes next.
@@ -217,7 +217,7 @@ class Dialogue:
         presses.
 
         Args:
-            phases: Phases of which each ends the waiting.
+            phases: Phases, each of which ends the waiting.
 
         Raises:
             SessionEnd: If the port or the input has ended.
@@ -265,8 +265,9 @@ class Dialogue:
     def _handle_line(self, line: str, press: SteadyPress | None, proposed: Array) -> bool:
         """Carry out the command that a person typed, or print why it cannot be carried out.
 
-        A press can only be recorded while a question about it is open. The command to remove a press concerns the
-        steady press if a question about it is open, or otherwise the press that was recorded last.
+        A press can only be recorded while a question about it is open. While a question about a steady press is open,
+        the command to remove a press concerns this press. At any other time, the command concerns the press that was
+        recorded last.
 
         Args:
             line: The typed line.
