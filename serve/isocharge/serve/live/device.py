@@ -147,7 +147,7 @@ def create_stages(setup: Setup, *, needs_contact: bool = False) -> list[Stage]:
             created.
 
     Raises:
-        DeviceError: If a setting states numbers for other electrodes than the given ones, or if warming must be
+        DeviceError: If a setting states numbers for electrodes other than the given ones, or if warming must be
             estimated with too few electrodes.
         ModelError: If a stage cannot use the model.
     """

@@ -209,8 +209,9 @@ def replay(
 ) -> Iterator[PredictionRecord]:
     """Compute the records of a recording again from its chunks, and yield the records.
 
-    The replay also executes the recorded requests, such as a new tare. For each chunk, it yields the same number of
-    records as the recorded stream. A line with a record therefore only means that the replay yields its next record.
+    The replay also executes the recorded requests, such as a new tare. For each chunk, the replay yields the same
+    number of records as the recorded stream. A line with a record therefore only means that the replay yields its next
+    record.
 
     Args:
         recording: Recording whose chunks are processed.

@@ -97,7 +97,7 @@ class PressWatch:
     """Smallest number of frames in a window."""
 
     MAX_HELD_S = 8.0
-    """Time since the touch after which a press is refused if it is not steady yet, s. A longer press would have a
+    """Time since the touch after which an unsteady press is refused, s. A longer press would have a
     larger error of the leak correction."""
 
     CHECK_INTERVAL_S = 0.05

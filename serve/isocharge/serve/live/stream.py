@@ -34,7 +34,7 @@ def stream(chunks: Iterable[Chunk], predictor: Predictor, device: Device = ANY_B
 
     Raises:
         ChargeError: If a frame has no value for an electrode of the model.
-        DeviceError: If the device file contains settings for other electrodes than those of the model.
+        DeviceError: If the device file contains settings for electrodes other than those of the model.
         TareError: If the film is touched during the whole search for a tare.
         PortError: If the stream has contained no intact frame in many bytes.
         PortLost: If the port disappears.
@@ -220,7 +220,7 @@ class TouchStream(ReadingStream):
                 used.
 
         Raises:
-            DeviceError: If the device file contains settings for other electrodes than those of the model.
+            DeviceError: If the device file contains settings for electrodes other than those of the model.
             ModelError: If the device file requires an estimate of the pretension, but the pretension of this film
                 cannot be estimated with the model.
         """

@@ -4,10 +4,10 @@ If the server has a token, the class `AccessCheck` refuses requests that do not 
 refuses requests from web pages of other sites.
 
 A page in a browser can send requests to every address that the browser can reach, including the loopback address. If
-the page sends a form, or a `fetch` with `mode: "no-cors"`, it cannot read the response, but the server executes the
-request. An attacker can also use DNS rebinding. After the browser has loaded the attacker's page, the attacker changes
-the DNS entry of the page's host name to the address of this machine. The browser then treats the attacker's page as a
-page of this server, and the page can also read the responses.
+the page sends a form, or a `fetch` with `mode: "no-cors"`, the page cannot read the response, but the server executes
+the request. An attacker can also use DNS rebinding. After the browser has loaded the attacker's page, the attacker
+changes the DNS entry of the page's host name to the address of this machine. The browser then treats the attacker's
+page as a page of this server, and the page can also read the responses.
 
 The server recognises requests from pages of other sites by the following headers, which pages cannot change.
 

@@ -111,7 +111,8 @@ class WriterQueue(Generic[T]):
         """Start the thread.
 
         Args:
-            write: Function that the thread calls with each item. If it returns False, the item counts as lost.
+            write: Function that the thread calls with each item. If the function returns False, the item counts as
+                lost.
         """
         self.lost = 0
         self._write = write

@@ -48,7 +48,7 @@ OUTPUT_KINDS: tuple[OutputKind, ...] = (
     MCAP_FILE,
     UDP,
 )
-"""Kinds of outputs of this package. If several kinds accept a target, the first of them is used."""
+"""Kinds of outputs of this package. If several kinds accept a target, the first of these kinds is used."""
 
 NO_OUTPUT = "none"
 """Target that receives no records."""
@@ -184,7 +184,7 @@ class Outputs:
                 self._handle_error(target, error)
 
     def _handle_error(self, target: str, error: Exception) -> None:
-        """Raise the error of an output, or write it to the log and write no further records to the output.
+        """Raise the error of an output, or log the error and write no further records to the output.
 
         In a replay, every error is raised. In a live stream, only an error of standard output is raised, and the stream
         continues without any other output that has failed. Only the first error of an output is written to the log.
@@ -224,7 +224,7 @@ class Outputs:
             queue: Queue of the thread that writes the records of a live stream; None in a replay.
 
         Raises:
-            Exception: The error of the output, if it cannot be closed.
+            Exception: The error of the output, if the output cannot be closed.
         """
         try:
             if queue is not None:

@@ -50,7 +50,7 @@ class GainRule(Rule, frozen=True, kw_only=True):
             raise WrongKey("pC_per_unit", "a finite number that is not 0, or one for each electrode", self.pC_per_unit)
 
     def charge_pC(self, electrode: str, values: Array) -> Array:
-        """Convert an array of values of one electrode to charges, pC. If the gain is not stated, it is 1."""
+        """Convert an array of values of one electrode to charges, pC. The default gain is 1."""
         gain_pC = self.pC_per_unit.get(electrode, 1.0) if isinstance(self.pC_per_unit, dict) else self.pC_per_unit
         offset = self.offset.get(electrode, 0.0) if isinstance(self.offset, dict) else self.offset
         return (values - offset) * gain_pC
@@ -120,8 +120,8 @@ class Channels:
     def indices_by_name_or_order(self, frame: Frame) -> tuple[int, ...] | None:
         """Find the channel of each electrode by the names or the order of the channels, without the device file.
 
-        A channel belongs to the electrode whose name it has. If no channel has the name of an electrode, the first
-        channel belongs to the first electrode, the second channel to the second electrode, and so on.
+        A channel with the name of an electrode belongs to this electrode. If no channel has the name of an electrode,
+        the first channel belongs to the first electrode, the second channel to the second electrode, and so on.
 
         Args:
             frame: A frame, whose channels may have names.

@@ -114,7 +114,7 @@ class Inflow:
         """
         rule = self._rule
         # Without a touch, the surplus is the difference of the noise of two frames. The standard deviation of this
-        # difference is sqrt(2) times that of one frame.
+        # difference is sqrt(2) times the standard deviation of one frame.
         limit_pC = np.maximum(rule.clip_pC, rule.clip_sigmas * math.sqrt(2.0) * noise_pC)
         clipped_surplus_pC = surplus_pC.clip(-limit_pC, limit_pC)
 
@@ -184,7 +184,7 @@ class Leak(Stage):
 
         Args:
             frame: The frame.
-            previous: The previous frame with charges; the frame itself if it is the first.
+            previous: The previous frame with charges. For the first frame with charges, the frame itself.
             output_pC: Output of the amplifiers above the tare, shape (n_electrode,), pC.
         """
         dt_s = frame.dt_s
@@ -215,8 +215,8 @@ class Leak(Stage):
             has_gap = False
         self._charge_pC = self._charge_pC + surplus_pC
         if has_gap:
-            # The surplus is right if the charge arrived evenly in the gap. A charge that arrived at its beginning is
-            # larger by the factor (1 + 1/a) / 2, which is 1 + (1/a - 1) / 2.
+            # The surplus is right if the charge arrived evenly in the gap. A charge that arrived at the beginning of
+            # the gap is larger by the factor (1 + 1/a) / 2, which is 1 + (1/a - 1) / 2.
             largest_error_pC = np.abs(surplus_pC) * (self._inverse_decay(frame) - 1.0) / 2.0
             if self._is_large(largest_error_pC, frame):
                 self._is_falsified = True

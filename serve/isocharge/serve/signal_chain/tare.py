@@ -32,7 +32,7 @@ class TareRule(Rule, frozen=True, kw_only=True):
             no current.
         patience: Number of frames after which the search for quiet frames ends with an error; 0 for no limit.
         relax_s: Time constant with which the tare follows a slow drift while nothing touches the film, s. The tare
-            changes by at most `noise_limit_pC / relax_s`, so that a touch does not change it noticeably.
+            changes by at most `noise_limit_pC / relax_s`, so that a touch does not change the tare noticeably.
     """
 
     frames: Annotated[int, Meta(ge=1, le=LARGEST)] = 100
@@ -94,7 +94,7 @@ class Tare(Stage):
         self._remaining_frames = rule.patience or math.inf  # number of frames after which the search ends with an error
 
     def step(self, frame: Frame) -> None:
-        """Subtract the tare from a frame. While there is no tare, search for it, and remove the charges from the frame.
+        """Subtract the tare from a frame. Without a tare, search for one, and remove the charges from the frame.
 
         If the tare follows a drift, each frame changes the tare by the drift that the previous frame shows.
 
@@ -135,9 +135,9 @@ class Tare(Stage):
     def _change_pC(self, frame: Frame) -> Array | float:
         """Return the change of the tare after a frame, shape (n_electrode,) or one number, pC.
 
-        While something touches the film, only the warming of the film changes the tare. Otherwise, the charges of the
-        frame are those of a film at rest, and the tare approaches them with the time constant `relax_s`. A large charge
-        may be the beginning of a touch, and counts only up to `noise_limit_pC`.
+        While something touches the film, only the warming of the film changes the tare. Otherwise, the film is at rest,
+        and the tare approaches the charges of the frame with the time constant `relax_s`. A large charge may be the
+        beginning of a touch, and counts only up to `noise_limit_pC`.
 
         Args:
             frame: The frame, whose charges no longer contain the tare.

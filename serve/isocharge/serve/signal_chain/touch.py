@@ -1,7 +1,7 @@
 """Detection of a touch from the vector of the charges of all electrodes, in units of the noise.
 
 Each charge is divided by the touch threshold of its electrode. The size of the charges is the norm of the vector of
-these ratios, so it does not depend on their signs.
+these ratios, so the size does not depend on the signs of the charges.
 
 The detection has a hysteresis. A touch begins when the size of the difference from the base exceeds 1. A touch ends
 when the size of the charges falls below a given share of the largest size of this touch. With a fixed threshold for the
@@ -194,8 +194,8 @@ class Touch(Stage):
     def _await(self, frame: Frame, charge: Array, size: float) -> None:
         """Process a frame while nothing touches the film: begin a touch, or update the base.
 
-        The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, it decays to zero. The
-        change is the difference between the charges and the base. The first rule in this list that applies is used:
+        The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, the base decays to zero.
+        The change is the difference between the charges and the base. The first rule in this list that applies is used:
 
         - If the change is opposite to the expected direction, a release or a drift has caused the change. The base
           becomes the mean of the latest charges (`_idle_mean_charge`).

@@ -19,10 +19,10 @@ pretension may have changed suddenly. The variance of the pretension then return
 The uncertain directions consist of properties that a film keeps. The variances of the changes along these directions
 therefore only decrease.
 
-The network was trained for the film as it was calibrated. The charges of a frame are therefore converted into charges
-that the same contact would cause on the calibrated film, and the network computes the contact from the converted
-charges. The conversion depends on the contact. The charges are therefore converted twice, the second time for the
-contact that the network computes after the first conversion.
+The network was trained for the calibrated film. The charges of a frame are therefore converted into charges that the
+same contact would cause on the calibrated film, and the network computes the contact from the converted charges. The
+conversion depends on the contact. The charges are therefore converted twice, the second time for the contact that the
+network computes after the first conversion.
 
 The estimate is considered wrong if no state explains the latest touches, or if the estimated pretension or the
 estimated offset is at an end of its range. In this case, the film is called lost. Until a new estimate explains the
@@ -267,7 +267,7 @@ class FilmFollower(Stage):
         self.reset()
 
     def _start_estimate(self) -> None:
-        """Set the state to that of the calibrated film, with the standard deviations before the first touch."""
+        """Set the state to the state of the calibrated film, with the standard deviations before the first touch."""
         self._state = np.zeros(self._initial_std.size)
         self._covariance = np.diag(self._initial_std**2)
 
@@ -285,8 +285,8 @@ class FilmFollower(Stage):
     def step(self, frame: Frame) -> None:
         """Correct the contact with the estimate from the earlier touches, and update the estimate when a touch ends.
 
-        An invalid frame does not change the estimate, because it does not show whether the touch has ended. If the film
-        is lost, every frame with a contact gets the flag `film`.
+        An invalid frame does not show whether the touch has ended, and therefore does not change the estimate. If the
+        film is lost, every frame with a contact gets the flag `film`.
         """
         frame.film = self.film
         if frame.contact is not None and frame.charge_pC is not None:
@@ -307,9 +307,9 @@ class FilmFollower(Stage):
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
-        describe, and the deviation of the offset of the touch from the common offset. The noise of the average charges
-        is assumed to be that of a single frame, because a board may filter its signals over the whole touch. If the
-        latest touches show that these errors are smaller, the covariance of the errors is scaled (`_error_scale`).
+        describe, and the deviation of the offset of the touch from the common offset. The average charges are assumed
+        to have the noise of a single frame, because a board may filter its signals over the whole touch. If the latest
+        touches show that these errors are smaller, the covariance of the errors is scaled (`_error_scale`).
 
         Args:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
@@ -396,7 +396,7 @@ class FilmFollower(Stage):
         unchanged_probability = unchanged_odds / (1.0 + unchanged_odds)
 
         # Without a change, the other unknowns have their conditional distribution for t = 0.
-        difference = change_MPa * self._covariance[0] / variance  # of the state with a change from that without one
+        difference = change_MPa * self._covariance[0] / variance  # of the state with a change from the other state
         self._applied_state = self._state - unchanged_probability * difference
         self._applied_covariance = self._covariance + unchanged_probability * np.outer(difference, difference)
         self._applied_covariance[self._offset, self._offset] += self._error_scale * self._offset_std_pC**2

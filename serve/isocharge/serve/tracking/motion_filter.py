@@ -186,7 +186,7 @@ class MotionFilter:
         self.probability = np.full(4, 0.25)
 
     def step(self, dt_s: float, measured: Array, covariance: Array) -> bool:
-        """Predict the modes at the next frame, and update them and their probabilities with the frame.
+        """Predict the modes at the next frame, and update the modes and their probabilities with the frame.
 
         Args:
             dt_s: Time since the previous frame, s, not negative.
@@ -231,7 +231,7 @@ class MotionFilter:
         noise += _HELD_RATE_COVARIANCE + dt_s * HELD_DRIFT_DENSITY
 
         # Predict the states. A value changes by its rate times the time. The rate of a held value has no effect, and is
-        # replaced by that of a movement that would begin now: zero on average.
+        # replaced by the rate of a movement that begins now: zero on average.
         transition = (_IDENTITY + dt_s * _INTEGRATION) * _PREDICTION_FACTOR  # shape (4, 6, 6)
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise

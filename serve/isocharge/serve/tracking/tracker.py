@@ -49,9 +49,9 @@ class TouchEvents:
     def step(self, tracked: TrackedContact, t_s: float) -> str | None:
         """Return the event that begins with the next frame of a touch, or None if no event begins.
 
-        A slide begins when the contact moves and is away from the position at which it last rested. A hold begins when
-        the contact has rested at one position for `HOLD_TIME_s`. No event occurs twice in succession. If it is
-        uncertain whether the contact moves or rests, no event begins.
+        A slide begins when the contact moves and has left its latest rest position. A hold begins when the contact has
+        rested at one position for `HOLD_TIME_s`. No event occurs twice in succession. If it is uncertain whether the
+        contact moves or rests, no event begins.
 
         Args:
             tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.
@@ -92,7 +92,7 @@ class TrackRule(Rule, frozen=True, kw_only=True):
     Attributes:
         lasting: Standard deviation of the errors that are the same in every frame of a held contact, divided by the
             standard deviation that the model states, 0 to below 1. The default of 0.12 was measured for the
-            approximation errors of a model. If the gains are known to only a few percent, set this to 0.99.
+            approximation errors of a model. If the gains are known to only a few percent, set `lasting` to 0.99.
     """
 
     lasting: Share = 0.12
@@ -148,7 +148,7 @@ class Tracker(Stage):
     def step(self, frame: Frame) -> None:
         """Update the tracked contact with a frame, and add the tracked contact and its event to the frame.
 
-        If another contact explains the charges as well, it is also added to the frame, as the attribute `other`.
+        If another contact explains the charges as well, the frame also gets this contact, as the attribute `other`.
 
         The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. If more
         than `MAX_GAP_s` have passed without a contact, a new filter begins. If the clock was set back, the touch

@@ -167,7 +167,7 @@ def wander(
 
 
 def corrupt(data: bytes, fraction: float, rng: np.random.Generator) -> bytes:
-    """Flip one bit in a random fraction of the bytes, as a faulty cable would damage them.
+    """Flip one bit in each byte of a random fraction of the bytes, to imitate a faulty cable.
 
     Args:
         data: The bytes before the damage.

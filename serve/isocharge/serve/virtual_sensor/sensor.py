@@ -35,7 +35,7 @@ from isocharge.serve.virtual_sensor.script import Faults, Script, corrupt
 PORT_BUFFER_BYTES = 3840
 """Largest number of bytes that wait for the reader.
 
-The buffer of Linux has 4095 bytes. If it were filled completely, a frame could be written incompletely.
+The buffer of Linux has 4095 bytes. If the buffer were filled completely, a frame could be written incompletely.
 """
 
 

@@ -68,7 +68,7 @@ def decompress(body: bytes, encoding: bytes, limit: int) -> bytes:
 
     Raises:
         RequestError: If the encoding is not gzip, deflate or identity, if the decompressed body is larger than the
-            limit, if the compressed data are damaged or incomplete, or if other data follow them.
+            limit, if the compressed data are damaged or incomplete, or if other data follow the compressed data.
     """
     if encoding in (b"", b"identity"):
         return body

@@ -217,7 +217,7 @@ ROUTES = (
     Route("GET", "/v2/models/{model}{version}/config", _show_config, ("ModelConfig",)),
     Route("POST", "/v2/models/{model}{version}/infer", _infer, ("ModelInfer", "ModelStreamInfer")),
 )
-"""All routes of the HTTP server. If several templates match a path, the first of them is used."""
+"""All routes of the HTTP server. If several templates match a path, the first of these templates is used."""
 
 UNKNOWN = Route("", "unknown", _show_server)
 """Route under which requests with unknown paths are counted. Such requests are refused."""
