@@ -216,7 +216,7 @@ def new_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Create a folder under a temporary name, and rename it to its final name at the end of the `with` block.
+    """Create a folder under a temporary name, and rename the folder to its final name at the end of the `with` block.
 
     If the block raises an exception, the folder is removed.
 

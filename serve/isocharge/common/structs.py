@@ -63,7 +63,7 @@ Text = Annotated[str, Meta(min_length=1, max_length=1000)]
 class Settings(Struct, frozen=True, forbid_unknown_fields=True):
     """Base class for the tables of a file. An unknown key in such a table is an error.
 
-    Each subclass must repeat `frozen=True`, because type checkers require it.
+    Each subclass must repeat `frozen=True`, because type checkers require the repetition.
     """
 
 
@@ -251,7 +251,7 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
     states which of them applies. The value of this key is called the tag.
 
     Args:
-        value: Value from TOML or JSON. If it is neither a table nor a list, the result is empty.
+        value: Value from TOML or JSON. If the value is neither a table nor a list, the result is empty.
         expected_type: Type that the value may have.
     """
     members = list(_union_members(expected_type))
@@ -276,8 +276,8 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
 def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int, Any]:
     """Return the types of the values that a table may have, by their keys, if structs declare these keys.
 
-    A struct declares the keys of the table if it has no tag, or if the table contains its tag. The value of the tag key
-    may be the tag of any of the structs.
+    A struct declares the keys of the table if the struct has no tag, or if the table contains the tag of the struct.
+    The value of the tag key may be the tag of any of the structs.
 
     Args:
         table: Table from TOML or JSON.

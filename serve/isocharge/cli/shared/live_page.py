@@ -172,7 +172,7 @@ class PageFeed:
         stream: RecordedStream | None = None,
         new_recorder: Callable[[Path, str], Recorder] | None = None,
     ) -> None:
-        """Store the page and the stream. If `stream` is given, the buttons of the page control it.
+        """Store the page and the stream. If `stream` is given, the buttons of the page control this stream.
 
         Args:
             page: The page.

@@ -263,7 +263,7 @@ class Dialogue:
                 self._say_phase(event)
 
     def _handle_line(self, line: str, press: SteadyPress | None, proposed: Array) -> bool:
-        """Carry out the command that a person typed, or print why it cannot be carried out.
+        """Carry out the command that a person typed, or print why the command cannot be carried out.
 
         A press can only be recorded while a question about it is open. While a question about a steady press is open,
         the command to remove a press concerns this press. At any other time, the command concerns the press that was
