@@ -134,7 +134,7 @@ class ModelStore:
         return [row for row in rows if version in ("", str(row.number))]
 
     def index(self) -> list[dict[str, str]]:
-        """Return one row for each version that is loaded, was refused or was unloaded, and for each model without versions.
+        """Return one row for each version that is loaded, refused or unloaded, and for each model without versions.
 
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
