@@ -11,8 +11,8 @@ sequences that JSON uses, such as `\\u001b`. A text in JSON therefore remains va
 
 If a package is not installed, an import within `require` raises an error that states the command for installing the
 missing extra. The names of `lazy_names` are imported only when a program uses them. A program that reads a dataset
-therefore does not wait for the import of the solver, a calibration does not wait for PyTorch, and a program that
-predicts contacts does not wait for the servers and the parsers of boards.
+therefore does not wait for the import of the solver, and a calibration does not wait for PyTorch. A program that
+predicts contacts does not wait for the import of the servers and of the parsers of boards.
 """
 
 import ast

@@ -122,8 +122,8 @@ N_SIMULATED_PRESSES = 24_000
 """Number of presses that `simulated_presses` returns for a sensor with at most `FEW_ELECTRODES` electrodes."""
 
 MANY_SIMULATED_PRESSES = 96_000
-"""Number of presses for a sensor with more electrodes, whose working area is larger. Networks that are
-trained on fewer presses have larger errors near the rim of this area."""
+"""Number of presses for a sensor with more electrodes, and therefore with a larger working area. Networks that are
+trained on fewer presses have larger errors near the rim of the working area."""
 
 
 def simulated_presses(

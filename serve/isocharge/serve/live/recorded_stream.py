@@ -127,7 +127,8 @@ class RecordedStream:
             self._use_recorder(None)
 
     def _use_recorder(self, recorder: Recorder | None) -> None:
-        """End the present recording, close its recorder, and record with another one, unless `recorder` is None."""
+        """End the present recording, and close its recorder. Unless `recorder` is None, begin to record with
+        `recorder`."""
         self._opened_recorder.close()
         self.recorder = recorder
         if recorder is not None:

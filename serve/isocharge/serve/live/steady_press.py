@@ -50,7 +50,7 @@ class Phase(StrEnum):
 
 
 class SteadyPress(NamedTuple):
-    """Charges of a press that was held still, which were measured in a time window.
+    """Charges of a press that was held still, measured in a time window.
 
     Attributes:
         charge_pC: Mean touch charges over the window, shape (n_electrode,), pC.

@@ -110,8 +110,8 @@ class Tls:
 class ServerLimits:
     """Limits of one server.
 
-    With the default limits, a server accepts the largest batch of presses of a film with four electrodes, even if the
-    batch is sent as JSON and each number has all its digits.
+    With the default limits, a server accepts the largest batch of presses of a film with four electrodes. This is true
+    even if the batch is sent as JSON and each number has all its digits.
 
     Attributes:
         body_bytes: Largest size of the body of a request, bytes. The limit applies before and after the body is

@@ -53,9 +53,9 @@ class Field(NamedTuple):
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
-    The annotation of each field contains a sentence that describes the value, and the section of the device file that
-    adds an optional field, as in `Annotated[str | None, "Event that begins.", "track"]`. An attribute without such an
-    annotation is not a field of the JSON object.
+    The annotation of each field contains a sentence that describes the value. The annotation of an optional field also
+    contains the section of the device file that adds the field, as in `Annotated[str | None, "Event that begins.",
+    "track"]`. An attribute without such an annotation is not a field of the JSON object.
     """
     fields: list[Field] = []
     for name, annotation in get_type_hints(struct, include_extras=True).items():  # with the metadata of `Annotated`

@@ -71,9 +71,9 @@ class Hum(Stage):
     def step(self, frame: Frame) -> None:
         """Subtract the hum from a frame, and update the estimate of the hum.
 
-        The hum of a channel is the real part of p u, where the phasor p contains its amplitude and phase, and the unit
-        phasor u = exp(2 pi i f t) turns with the frequency f of the mains. The frame is compared with an earlier frame,
-        the reference. If u has changed by z since then, the charges should have changed by the real part of p z.
+        The hum of a channel is the real part of p u. The phasor p contains the amplitude and the phase of the hum. The
+        unit phasor u = exp(2 pi i f t) turns with the frequency f of the mains. The frame is compared with an earlier
+        frame, the reference. If u has changed by z since then, the charges should have changed by the real part of p z.
         """
         if frame.charge_pC is None:
             return

@@ -101,10 +101,11 @@ class Touch(Stage):
     touch threshold. The peak is the largest size that two consecutive frames of the touch have reached. The spike of a
     single frame is not a peak.
 
-    If the mean charges of the last `RISE_S` have already exceeded half of the touch threshold when a touch begins, the
-    charges have risen slowly, and a drift of the charge at rest may have caused the touch. All frames of the touch then
-    have the flag `drift`. For a board that sends currents, the limit is three quarters of the threshold. A touch also
-    has the flag `drift` if the charges before the touch were opposite to the touch, as after a long press with a leak.
+    When a touch begins, the mean charges of the last `RISE_S` may already exceed half of the touch threshold. The
+    charges have then risen slowly, and a drift of the charge at rest may have caused the touch. In this case, all
+    frames of the touch have the flag `drift`. For a board that sends currents, the limit is three quarters of the
+    threshold. A touch also has the flag `drift` if the charges before the touch were opposite to the touch, as after a
+    long press with a leak.
 
     If charges exceed the touch threshold in the direction opposite to a touch, the frame has the flag `negative`.
     """

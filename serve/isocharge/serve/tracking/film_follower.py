@@ -20,7 +20,7 @@ The uncertain directions consist of properties that a film keeps. The variances 
 therefore only decrease.
 
 The network was trained for the calibrated film. The charges of a frame are therefore converted into charges that the
-same contact would cause on the calibrated film, and the network computes the contact from the converted charges. The
+same contact would cause on the calibrated film. The network computes the contact from the converted charges. The
 conversion depends on the contact. The charges are therefore converted twice, the second time for the contact that the
 network computes after the first conversion.
 
@@ -120,7 +120,7 @@ The offset of a single touch deviates from the common offset with the same stand
 """
 
 SMALLEST_STD = 1e-4
-"""Smallest standard deviation of an unknown, in its unit, so that the covariance can be inverted."""
+"""Lower limit for the standard deviation of an unknown, in its unit. The covariance can then be inverted."""
 
 MAX_DEVIATION = 20.0
 """Largest magnitude of an unknown, in standard deviations before the first touch."""
@@ -142,8 +142,8 @@ an unchanged film are less accurate.
 CLEAR_CHANGE = 3.0
 """Number of standard deviations above which the change of an unknown is clear.
 
-An unknown at an end of its range is implausible only if its change is clear, because the pretension of a nearly slack
-film is always close to its lower end.
+An unknown at an end of its range is implausible only if its change is clear. This condition is needed, because the
+pretension of a nearly slack film is always close to the lower end of its range.
 """
 
 FADING_TOUCHES = 512
@@ -404,8 +404,8 @@ class FilmFollower(Stage):
     def _values(self, contacts: Array, state: Array) -> ModelValues:
         """Compute the charges that the board would measure under touches, and their derivatives.
 
-        The measured charge of an electrode is g q + r p, where q is the charge of the film, g is the gain of the
-        electrode, p is the common offset, and r is the given ratio of the electrode's offset to p.
+        The measured charge of an electrode is g q + r p. In this formula, q is the charge of the film, g is the gain of
+        the electrode, p is the common offset, and r is the given ratio of the electrode's offset to p.
 
         Args:
             contacts: Contacts (x, y, ln F) of n touches, shape (n, 3), mm and the logarithm of N.

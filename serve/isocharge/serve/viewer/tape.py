@@ -69,9 +69,9 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
 def coalesce(samples: Samples, max_samples: int) -> Samples:
     """Reduce the number of samples by replacing each run of neighbouring samples with one sample of the run.
 
-    By default, the latest sample of a run is chosen. If the latest sample is not a contact, but the run contains
-    contacts, the contact with the largest force is chosen instead, so that short taps are not lost. The chosen sample
-    gets the flags of all samples of the run, and the total number of records in the run.
+    By default, the latest sample of a run is chosen. If only earlier samples of the run are contacts, the contact with
+    the largest force is chosen instead, so that short taps are not lost. The chosen sample gets the flags of all
+    samples of the run, and the total number of records in the run.
 
     Args:
         samples: The samples, shape (n,).

@@ -169,8 +169,8 @@ def _refuse_settings(path: Path | None, config: FitConfig) -> None:
 def _release(fitted: Fitted, model_folder: Path, version: int) -> Release:
     """Write a trained network as a version of a model.
 
-    If the folder of the model refuses the version, for example because the disk is full or because another process has
-    written this version during the training, the version is written to a new temporary folder.
+    If the version cannot be written to the folder of the model, the version is written to a new temporary folder. For
+    example, the disk may be full, or another process may have written this version during the training.
 
     Args:
         fitted: The network.
@@ -178,7 +178,8 @@ def _release(fitted: Fitted, model_folder: Path, version: int) -> Release:
         version: Number of the version.
 
     Raises:
-        IsochargeError: If the folder refuses the version. The message names the temporary folder.
+        IsochargeError: If the version cannot be written to the folder of the model. The message names the temporary
+            folder.
     """
     write = partial(release, fitted, version=version, command=this_command())
     try:
