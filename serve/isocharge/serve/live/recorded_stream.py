@@ -127,8 +127,7 @@ class RecordedStream:
             self._use_recorder(None)
 
     def _use_recorder(self, recorder: Recorder | None) -> None:
-        """End the present recording, and close its recorder. Unless `recorder` is None, begin to record with
-        `recorder`."""
+        """End the present recording, and close its recorder. Then record with `recorder`, unless it is None."""
         self._opened_recorder.close()
         self.recorder = recorder
         if recorder is not None:
