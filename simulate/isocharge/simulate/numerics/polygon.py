@@ -19,7 +19,7 @@ from isocharge.common.arrays import Array, Complexes
 from isocharge.simulate.numerics.interpolation import gauss_line
 
 MERGE_DISTANCE = 1e-9
-"""Distance below which two corners or two y coordinates of corners are treated as equal, mm."""
+"""Width of a strip along a boundary whose area is neglected when areas are compared, mm."""
 
 MIN_BEND = 0.1
 """Smallest allowed value of 1 + cos(angle), where `angle` is the angle by which a trace bends, dimensionless.
