@@ -308,10 +308,10 @@ class Parser(ABC):
     def sequence_flags(self, seq: int | None, *, is_clock_reset: bool = False) -> tuple[str, ...]:
         """Compare the counter of a frame with the counter of the previous frame, and return the flags of the frame.
 
-        The flags depend on the increase of the counter since the previous frame. After an increase of 1, the frame is
-        the next frame. After an increase of 0, it is a repeated frame. Any other small increase means that frames were
-        lost. A small decrease means that the frame is late. Any other change means that the device has restarted. Lost
-        frames, repeated frames and restarts are added to `counts`.
+        The flags depend on the increase of the counter since the previous frame. An increase of 1 means that no frame
+        was lost. If the counter has not changed, the frame is a repetition. Any other small increase means that frames
+        were lost. A small decrease means that the frame is late. Any other change means that the device has restarted.
+        Lost frames, repeated frames and restarts are added to `counts`.
 
         Args:
             seq: Counter of the frame; None if the format has no counter.

@@ -172,7 +172,10 @@ class TextParser(DelimitedParser):
             return self._reject(size)
 
     def _store_comment(self, text: str) -> None:
-        """While no layout is recognised, store a comment without numbers, such as `# t_ms,A,B,C`, as a possible header.
+        """Store a comment such as `# t_ms,A,B,C`, which may be the header with the names of the columns.
+
+        A comment with numbers is no header, and no header is needed after a layout has been recognised. In both cases,
+        the comment is only stored as the latest text that is not a frame.
 
         Args:
             text: The comment, or an empty text for a blank line.

@@ -17,8 +17,8 @@ as the 3 in `ch 3: 801`, is a name. All lines with one skeleton contain the same
 voltage, and the same words before a colon or an equals sign. All other words may change from line to line. Quotes
 around a number have no meaning.
 
-The shape of a line is a text with one symbol for each part of the line. Regular expressions find the names and the
-units in this shape. For example, the shape of `A: 801.2 pC, B: -799.5 pC` is `k:0u,k:0u`.
+The module `text_parts` divides a line into parts. Regular expressions find the names and the units in the shape of the
+line, which contains one symbol for each part.
 """
 
 import math
@@ -28,65 +28,20 @@ from itertools import takewhile
 from types import MappingProxyType
 from typing import NamedTuple
 
-from isocharge.serve.frames.frame import OTHER_CHARGE_UNITS, SEQ, TIMES_US
-
-_QUOTED = r'"(?:[^"\\]|\\.)*"' + r"|(?<!\w)'[^']*'(?!\w)"
-"""Regular expression of a text in quotes."""
-
-_KEY = r"""(?:[0-9]+(?=[^\W\d_]))?(?![0-9()\[\]+.*$|&/-]|#[0-9])(?>(?:[^\s:=,;|&{}"'<>()]|\([^\s()]*\))+)"""
-"""Regular expression of a key without quotes, which is a name before a colon or an equals sign."""
-
-_INDEX = r"\[\w*\](?!\s*[,;]?\s*(?:$|[^\W\d]))"  # not the value in `C[7] A[3]`, which stands before a name or the end
-
-_TIME = (
-    r"(?:[0-9]{1,4}[-/.][0-9]{1,2}[-/.][0-9]{1,4}[T ,;]+)?"  # a date
-    r"[0-9]{1,2}:[0-9]{2}:[0-9]{2}"
+from isocharge.serve.frames.frame import SEQ, TIMES_US
+from isocharge.serve.frames.text_parts import (
+    CHARGE_UNITS,
+    FRACTION,
+    IGNORED_AT_END,
+    NUMBER,
+    NUMBER_WITH_COMMA,
+    PATTERNS,
+    TIME,
+    ZONE,
+    Part,
+    parts_of,
+    shape_of,
 )
-"""Regular expression of a time in whole seconds, with or without a date."""
-
-_FRACTION = r"(?:\.[0-9]+(?:[.,][0-9]{3}(?=\]))?|,[0-9]{3}(?=\s)|,[0-9]+(?=;))"
-"""Regular expression of a fraction of a second, as in `56.789`, `56.789,012]`, `56,7;`, or `56,789` before a blank."""
-
-_ZONE = r"(?:Z|[-+][0-9]{2}:?[0-9]{2}(?![\w.]))?(?![\w:])"
-"""Regular expression of the time zone after a time. The time zone may be missing."""
-
-_NUMBER = r"(?>[-+]?(?:(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|(?<!<)(?i:nan|inf(?:inity)?|ovf)(?!\w)))"
-"""Regular expression of a decimal number, which also matches `nan`, `inf` and the `ovf` of Arduino."""
-
-_NUMBER_WITH_COMMA = _NUMBER.replace(r"\.[0-9]*", r"(?:\.[0-9]*|,[0-9]+)")
-"""Regular expression of a decimal number that may have a decimal comma instead of a decimal point."""
-
-_PATTERNS = {
-    "coarse_time": rf"(?<![\w.:]){_TIME}(?!{_FRACTION}{_ZONE}){_ZONE}",  # whole seconds, too coarse for a clock
-    "time": rf"(?<![\w.:]){_TIME}{_FRACTION}?{_ZONE}",  # some programs omit a fraction that is zero
-    "uptime": r"(?<=\b[EWIDV]\s\()[0-9]+(?=\))",
-    "key": rf"(?<=^\$)\w+|(?:{_KEY}|{_QUOTED})(?=\s*[:=])",
-    "quoted": f"(?:{_QUOTED})",
-    "hexadecimal": r"(?<![\w.])[-+]?0[xX][0-9A-Fa-f]{1,16}(?!\w)",
-    "number": rf"(?<!\w)(?<!\w\.){_NUMBER}(?!\.[0-9])(?=[^\W\d_]*(?!\w))",
-    "word": rf"(?>\w+(?:[./-]\w+)*(?:{_INDEX})*)",
-    "mark": r"\.{2,}|\S",
-}
-"""Regular expression of each kind of part of a line, in the order in which the kinds are tried."""
-
-_PART = re.compile("|".join(f"(?P<{kind}>{pattern})" for kind, pattern in _PATTERNS.items()))
-"""Regular expression of a part of a line. The name of the group that matches is the kind of the part."""
-
-_SYMBOLS = {
-    "time": "t",
-    "coarse_time": " ",
-    "uptime": "t",
-    "key": "k",
-    "quoted": "q",
-    "hexadecimal": "0",
-    "number": "0",
-    "word": "w",
-}
-"""For each kind of part: the symbol that stands for the part in the shape of a line, such as `k=0,k=0`.
-
-A mark stands for itself. A word or a key that is a unit of charge or voltage has the symbol u.
-"""
-
 
 _NAMES_OF_TIMES = {"time": "t_s", "uptime": "t_ms"}
 """Name of a time of day, in seconds since midnight, and name of the time in a log prefix such as `I (1234)`."""
@@ -119,19 +74,6 @@ A comma may take the place of the name, as in `"A": {"raw": 512, "nC": 3.5}`, an
 the number, as in `"unit": "nC", "value": 3.5`.
 """
 
-_IGNORED_AT_END = ",; \t"
-"""Marks without a meaning at the end of a line."""
-
-_UNCLEAR = (
-    r"(?:^|[\s;])[-+]?[0-9.]+(?:(?:\s*[fnpuµμm]?[CV])?\s+-\s+[.0-9]|-(?:[\s,;]|$))"
-    r"|(?:[:=>]\s*[-+]?[0-9]+,[0-9]++(?!\s*[:=]|,[-+.0-9]).*){2}"
-)
-"""Regular expression of a text in which a minus or a comma may have two meanings, so that its numbers are not clear.
-
-A minus after a number, as in `3.5 - 2.5` and `3.5-`, may be a sign or a separator. Commas behind several names, as in
-`A=18,537 B=18,402 T=23.5`, may be decimal commas, separators of thousands, or separators of columns.
-"""
-
 _SEPARATING_COMMA = (
     r"[0-9]\.[0-9]|[0-9],[0-9]+,[0-9]"  # a number with a decimal point or two commas
     r"|[0-9],[-+.]|[0-9]\s*,\s+[-+.0-9]|[0-9]\s+,"  # before a sign or beside a blank
@@ -140,42 +82,11 @@ _SEPARATING_COMMA = (
 )
 """Regular expression of a text that shows that the commas of a line are separators."""
 
-_DECIMAL_COMMA = rf"(?P<time>{_TIME}{_FRACTION}?,?)|(?<=[0-9]),(?=[0-9])"
+_DECIMAL_COMMA = rf"(?P<time>{TIME}{FRACTION}?,?)|(?<=[0-9]),(?=[0-9])"
 """Regular expression of a comma between digits.
 
 The expression also matches a whole time, because a comma in a time is not a decimal comma.
 """
-
-_CHARGE_UNITS = {*OTHER_CHARGE_UNITS, "pC"} - {"C"}
-"""Units of charge and voltage, except C, which may be the name of an electrode."""
-
-
-class _Part(NamedTuple):
-    """Part of a line: a number, a name, a key before a colon or an equals sign, a text in quotes, a word, or a mark.
-
-    Attributes:
-        kind: Kind of the part, a key of `_PATTERNS`.
-        symbol: Character that stands for the part in the shape of a line; see `_SYMBOLS`.
-        content: Text of the part.
-        start: Position in the line at which the part begins.
-        is_after_blank: Whether a blank stands before the part.
-    """
-
-    kind: str
-    symbol: str
-    content: str
-    start: int
-    is_after_blank: bool
-
-    @property
-    def name(self) -> str:
-        """Content without quotes."""
-        return self.content.strip("\"'")
-
-    @property
-    def is_number(self) -> bool:
-        """Whether the part is a number or a time that is fine enough for a clock."""
-        return self.symbol in "0t"
 
 
 class Line(NamedTuple):
@@ -207,7 +118,7 @@ class Line(NamedTuple):
 def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, str] = MappingProxyType({})) -> Line:
     """Divide a line of text into its numbers and its skeleton, which is the text between the numbers.
 
-    A line in which a minus or a comma may have two meanings (see `_UNCLEAR`) is returned without numbers.
+    A line in which a minus or a comma may have two meanings (see `text_parts.UNCLEAR`) is returned without numbers.
 
     Args:
         text: The line, as `clean_text` returns it.
@@ -220,13 +131,13 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
     """
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
-    number_pattern = _NUMBER  # of the numbers in the skeleton
+    number_pattern = NUMBER  # of the numbers in the skeleton
     text_with_points = text
     if _has_decimal_commas(text):
-        number_pattern = _NUMBER_WITH_COMMA
+        number_pattern = NUMBER_WITH_COMMA
         # Replace each decimal comma by a point, and each time by itself. All positions in the text remain the same.
         text_with_points = re.sub(_DECIMAL_COMMA, lambda match: match["time"] or ".", text)
-    parts = _parts(text_with_points)
+    parts = parts_of(text_with_points)
     counters = {SEQ, *TIMES_US, *meanings}
     names = _alternating_names(parts, has_header=has_header) or _preceding_names(parts, counters)
     names_with_units = _with_units(names, _units(parts, names), counters)
@@ -252,7 +163,7 @@ def _has_decimal_commas(text: str) -> bool:
     - The line has brackets, as in `(4,3) (5,2)`. Even in a line with brackets, several commas are decimal commas if
       each number with a comma follows a colon or an equals sign.
     """
-    text = re.sub(f"{_TIME}{_FRACTION}?(?:{_ZONE})?", "", text)
+    text = re.sub(f"{TIME}{FRACTION}?(?:{ZONE})?", "", text)
     number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))  # `4,3` counts as one number
     comma_count = len(re.findall("[0-9],[0-9]", text))
     named_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", text))  # numbers with a comma and a name, as in `A:4,3`
@@ -264,84 +175,7 @@ def _has_decimal_commas(text: str) -> bool:
     return are_all_named or re.search(r"[\[({]", text) is None
 
 
-def _parts(text: str) -> list[_Part]:
-    """Return the parts of a line; empty if a minus or a comma in the line may have two meanings.
-
-    If a number is the index of a channel, it becomes a key, because the index is the name of the next number.
-
-    Args:
-        text: The line, with decimal points instead of decimal commas.
-    """
-    if re.search(_UNCLEAR, text):
-        return []
-    parts = []
-    for match in _PART.finditer(text.rstrip(_IGNORED_AT_END)):
-        kind = str(match.lastgroup)  # name of the group that matches
-        content = match[0]
-        symbol = _SYMBOLS.get(kind, content[0])  # a mark stands for itself
-        if kind in ("word", "key") and content.strip("[]") in _CHARGE_UNITS:
-            symbol = "u"
-        start = match.start()
-        is_after_blank = text[start - 1 : start].isspace()  # false for the first part, which has no text before it
-        parts.append(_Part(kind, symbol, content, start, is_after_blank))
-    for position in _index_positions(parts):
-        parts[position] = parts[position]._replace(kind="key", symbol="k")
-    return parts
-
-
-def _shape(parts: list[_Part]) -> str:
-    """Return the symbols of the parts of a line; see `_SYMBOLS`."""
-    return "".join(part.symbol for part in parts)
-
-
-def _index_positions(parts: list[_Part]) -> list[int]:
-    """Return the positions of the numbers that are not values but indices of channels.
-
-    In `ch 1 = 801 pC`, the number 801 is a value, and the number 1 is the index of its channel. The last numbers of a
-    line are pairs of an index and a value in these cases:
-
-    - A colon or an equals sign stands between the two numbers of each pair, as in `1:801,2:799` and `ch 1 = 801 pC`.
-      There are several pairs, or the line has no other numbers.
-    - There are several pairs. Their first numbers count up from 0 or 1, and the same word or mark stands before each
-      first number, as in `pad #1 801 pad #2 799` and `[1] 801 [2] 799`.
-
-    Args:
-        parts: Parts of the line. A position is an index in this list.
-    """
-    # The shape of a line has one symbol for each part: 0 for a number, w for a word and u for a unit. Marks stand for
-    # themselves. A position in the shape is therefore the position of a part.
-    shape = _shape(parts)
-    number_positions = [position for position, symbol in enumerate(shape) if symbol == "0"]
-
-    def first_numbers(pair: str) -> list[int]:
-        """Return the position of the first number of each pair at the end of the line; empty if there is no pair.
-
-        Args:
-            pair: Regular expression of the shape of a pair, in which each number is a 0.
-        """
-        # Parts that are not numbers, [^0]*, may stand before each pair and behind the last pair.
-        pairs = re.search(f"(?:[^0]*{pair})+[^0]*$", shape)
-        if pairs is None:
-            return []
-        paired_count = pairs[0].count("0")  # the pairs consist of this many numbers, which are the last of the line
-        return number_positions[-paired_count::2]
-
-    # Find pairs such as `1:801`. A closing bracket may follow the first number.
-    positions = first_numbers(r"0[)\]]?[:=]0")
-    has_only_pairs = len(number_positions) == 2 * len(positions)
-    if len(positions) > 1 or has_only_pairs:
-        return positions
-
-    # Find pairs such as `pad 1 801` and `[1] 801`, in which a word or a mark stands before the first number.
-    positions = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")
-    first_contents = [parts[position].content for position in positions]
-    numerals = [str(number) for number in range(len(positions) + 1)]
-    counts_up = first_contents in (numerals[:-1], numerals[1:])  # from 0, or from 1
-    labels = {parts[position - 1].content for position in positions}  # the words or marks before the first numbers
-    return positions if len(positions) > 1 and counts_up and len(labels) == 1 else []
-
-
-def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tuple[str, ...]:
+def _skeleton(parts: list[Part], names: list[str], number_pattern: str) -> tuple[str, ...]:
     """Return the skeleton of a line; see `Line`.
 
     Args:
@@ -349,7 +183,7 @@ def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tupl
         names: Names of the numbers.
         number_pattern: Regular expression of a decimal number.
     """
-    fixed_words = {*names, *_CHARGE_UNITS}  # must be the same in all lines of a layout; other words may change
+    fixed_words = {*names, *CHARGE_UNITS}  # must be the same in all lines of a layout; other words may change
     patterns = []
     previous_kind = ""
     for part in parts:
@@ -360,30 +194,30 @@ def _skeleton(parts: list[_Part], names: list[str], number_pattern: str) -> tupl
         # A word that directly follows a number, as in `3.5mV`, is the unit of the number.
         is_unit = previous_kind in ("number", "hexadecimal") and not part.is_after_blank
         if part.is_number:
-            pattern = number_pattern if part.kind == "number" else _PATTERNS[part.kind]
+            pattern = number_pattern if part.kind == "number" else PATTERNS[part.kind]
             patterns.append(f"({pattern})")
         elif part.kind in ("key", "mark") or part.name in fixed_words or is_unit:
             patterns.append(re.escape(part.content))
         else:
-            patterns.append(_PATTERNS[part.kind])
+            patterns.append(PATTERNS[part.kind])
         previous_kind = part.kind
     return tuple(patterns)
 
 
-def _is_prose(parts: list[_Part]) -> bool:
+def _is_prose(parts: list[Part]) -> bool:
     """Return whether a line resembles a message of a board instead of a frame.
 
     A message has at least as many words as numbers, as in `Channel 3 is ready`. Units of charge, words that follow a
     comma or another mark, and the key of a single number are not counted. A line with a hexadecimal number may be a
     message, too. For example, boards print the address and the size of each part of their program when they start.
     """
-    shape = _shape(parts)
+    shape = shape_of(parts)
     number_count = len(re.findall("[0t]", shape))
     words = re.findall(r"(?<!\W)[kw]" if number_count > 1 else r"(?<!\W)w", shape)
     return len(words) >= number_count or any(part.kind == "hexadecimal" for part in parts)
 
 
-def _words(parts: list[_Part], pattern: str) -> list[str]:
+def _words(parts: list[Part], pattern: str) -> list[str]:
     """Return the word that belongs to each number, or the name of each time; empty for a number without a word.
 
     Args:
@@ -391,7 +225,7 @@ def _words(parts: list[_Part], pattern: str) -> list[str]:
         pattern: Regular expression for the shape of the line. Its group `word` matches a word, and its group `number`
             matches the number to which the word belongs.
     """
-    words = {match.start("number"): parts[match.start("word")].name for match in re.finditer(pattern, _shape(parts))}
+    words = {match.start("number"): parts[match.start("word")].name for match in re.finditer(pattern, shape_of(parts))}
     return [
         _NAMES_OF_TIMES.get(part.kind) or words.get(position, "")
         for position, part in enumerate(parts)
@@ -404,7 +238,7 @@ def _unique(names: list[str]) -> list[str]:
     return [name if name in TIMES_US or names.count(name) == 1 else "" for name in names]
 
 
-def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
+def _alternating_names(parts: list[Part], *, has_header: bool) -> list[str]:
     """Return the names of the numbers if names and numbers alternate in the line; otherwise, return an empty list.
 
     The names are the words next to the numbers. They stand either before all numbers, as in `C,7,A,3` and `C[7] A[3]`,
@@ -420,17 +254,17 @@ def _alternating_names(parts: list[_Part], *, has_header: bool) -> list[str]:
     """
     # The shape has one symbol for each part: t for a time, u for a unit, w for another word, and 0 for a number. Marks
     # stand for themselves. A time may stand before a single pair, and a unit behind it.
-    shape = _shape(parts)
+    shape = shape_of(parts)
     is_single_pair = re.fullmatch("[t ,;]*[uw][,;|]0[uw]?", shape) is not None
     if is_single_pair or (shape.count("0") > 1 and not has_header):
         for pattern in (_WORD_BEFORE, _WORD_BEHIND):
             names = _words(parts, pattern)
-            if all(_unique(names)) and _CHARGE_UNITS.isdisjoint(names):
+            if all(_unique(names)) and CHARGE_UNITS.isdisjoint(names):
                 return names
     return []
 
 
-def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
+def _preceding_names(parts: list[Part], counters: Container[str]) -> list[str]:
     """Return the name of each number, or an empty text for a number without a name.
 
     The name of a number is the nearest word or key before the number, as in `A: 3.5`, `A -> 3.5` and `<A>3.5</A>`. The
@@ -454,7 +288,7 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
     value_indices = [index for index, name in enumerate(names) if name not in TIMES_US]  # of all numbers except clocks
 
     # In the shape of a line, u is a unit and w is another word. Only marks may follow the last word.
-    ends_with_word = re.search(r"[uw]\W*$", _shape(parts)) is not None
+    ends_with_word = re.search(r"[uw]\W*$", shape_of(parts)) is not None
     if value_indices and not names[value_indices[0]] and ends_with_word:
         names = ["" if name in words else name for name in names]
 
@@ -467,7 +301,7 @@ def _preceding_names(parts: list[_Part], counters: Container[str]) -> list[str]:
     return names
 
 
-def _units(parts: list[_Part], names: list[str]) -> list[str]:
+def _units(parts: list[Part], names: list[str]) -> list[str]:
     """Return the unit of charge or voltage of each number; empty for a number without such a unit.
 
     The unit stands behind the number, as in `A=3.5 nC`, or between the name and the number, as in `A (nC): 3.5`. A unit
@@ -483,10 +317,10 @@ def _units(parts: list[_Part], names: list[str]) -> list[str]:
     # The word `C` behind a number may be the name of an electrode, as in `7 C, 3 A`, and one `C` may be the unit of a
     # temperature (degrees Celsius). If the word occurs more often, it is the unit of the charges (coulomb).
     is_coulomb = words_behind.count("C") > names.count("C") + 1
-    units = {*_CHARGE_UNITS, "C"} if is_coulomb else _CHARGE_UNITS
+    units = {*CHARGE_UNITS, "C"} if is_coulomb else CHARGE_UNITS
 
     # Find the unit before the first name. The shape has one symbol for each part, and 0 for a number.
-    shape_before_numbers, _, _ = _shape(parts).partition("0")
+    shape_before_numbers, _, _ = shape_of(parts).partition("0")
     first_words = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
     words_before_names = takewhile(lambda word: word not in names, first_words)
     common_unit = next((word for word in words_before_names if word in units), "")
@@ -582,7 +416,7 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
         line: The line.
     """
     starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
-    header = header.lstrip("#%/ ").rstrip(_IGNORED_AT_END)
+    header = header.lstrip("#%/ ").rstrip(IGNORED_AT_END)
     separator = _separator(header)  # None for blanks
     line_separator = "\t" if "\t" in line.text else _separator(line.skeleton)
     if separator is None and line_separator is not None:  # the header is a message, such as `the tare is done`
