@@ -12,6 +12,8 @@ from isocharge.simulate import (
     Circle,
     Film,
     Polygon,
+    Resolution,
+    SolveSettings,
     deflection,
     load_sensor,
     press,
@@ -52,3 +54,12 @@ def test_hard_cases_converge_or_raise_a_clear_error(film, probe, at, force):
     assert np.isfinite(read_charges(solved)).all()
     assert deflection(solved, np.array([at]))[0] > 0.0
     assert 0.0 <= estimated_error(solved, read_charges) < 0.2
+
+
+def test_more_force_is_advised_on_a_slack_film_and_stretches_it(monkeypatch):
+    monkeypatch.setattr("isocharge.simulate.solver.newton.MAX_ITERATIONS", 6)  # no number suffices for 0.05 N
+    film = Film(45.0, 0.025, 3000.0, 0.34, -2.0)
+    mesh = SolveSettings(resolution=Resolution(4, 8, 5))
+    with pytest.raises(SolveError, match=r"it wrinkles, .* with more force, or give the film a pretension"):
+        press(film, Circle(1.0), (10.0, 0.0), 0.05, mesh)
+    assert press(film, Circle(1.0), (10.0, 0.0), 0.5, mesh).status == "converged"

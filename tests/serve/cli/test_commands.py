@@ -345,3 +345,21 @@ def test_a_board_that_is_not_recognised_names_the_doctor(models, command, count,
     board.close()
     assert (code, out) == (1, "")
     assert f"isocharge serve doctor --port {board.url} --write board.toml" in err
+
+
+def test_a_recording_that_was_killed_is_readable(board, models, start_stream, tmp_path, run):
+    """It lacks at most the records of the chunk that was being made."""
+    path = tmp_path / "touch.rec"
+    process = start_stream(board.url, "--record", path)
+    lines = [process.stdout.readline() for _ in range(500)]
+    process.kill()
+    process.wait()
+    replayed = run("replay", path, "--models", models).stdout.splitlines(keepends=True)
+    assert replayed
+    assert replayed[:500] == lines[: len(replayed)]
+
+
+def test_stream_ends_if_its_stdout_is_never_read(board, start_stream):
+    process = start_stream(board.url, "--seconds", 1)
+    assert process.wait(60) == 0
+    assert "records not written, the oldest" in process.stderr.read()

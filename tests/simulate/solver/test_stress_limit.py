@@ -7,7 +7,7 @@ import pytest
 
 from isocharge.common.errors import SceneError
 from isocharge.simulate import Circle, load_sensor, press
-from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, yield_force
+from isocharge.simulate.solver.stress_limit import force_within_stress, largest_stress, stress_caution, yield_force
 
 FILM = load_sensor("four-25um-biaxial").film
 TIP = Circle(1.0)
@@ -56,3 +56,11 @@ def test_yield_force_of_a_taut_film_lies_in_the_range_and_that_of_a_small_film_i
 def test_yield_force_of_a_single_force_that_stresses_the_film_too_much():
     assert yield_force(FILM, [TIP], (15.0, 15.0)) == 15.0
     assert yield_force(FILM, [TIP], (0.05, 0.05)) is None
+
+
+@pytest.mark.parametrize(("force", "stress"), [(1.0, 48.8), (2.0, 74.3)])
+def test_probe_of_1_mm_exceeds_the_yield_stress_of_pvdf(force, stress):
+    largest = largest_stress(FILM, TIP, force)
+    assert largest == pytest.approx(stress, rel=3e-3)
+    assert f"{force:g} N under circle:1.0 stress the film to {largest:.3g} MPa" in stress_caution(FILM, TIP, force)
+    assert not stress_caution(FILM, TIP, 0.4 * force)
