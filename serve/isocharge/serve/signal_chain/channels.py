@@ -263,7 +263,7 @@ def _reversed_without_common_start(texts: list[str]) -> list[str]:
 
 
 def _are_in_order(names: tuple[str, ...]) -> bool:
-    """Return whether the numbers in names increase, as in `ch1_v2` and `ch2_v2`; true if any name has no number."""
+    """Return whether names are in the order of their numbers, as `ch1_v2`, `ch2_v2`; true if a name has no number."""
     numbers = [[int(digits[-9:]) for digits in re.findall("[0-9]+", name)] for name in names]
     return [] in numbers or numbers == sorted(numbers)
 
