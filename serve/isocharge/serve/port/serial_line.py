@@ -171,7 +171,7 @@ class SerialLine:
 
 
 class Requester:
-    """Serial line to a board that sends a frame only when asked. The line sends the requests, and removes their echoes."""
+    """Connection to a board that sends a frame only on request. It sends the requests, and removes their echoes."""
 
     def __init__(self, line: SerialLine, request: Request) -> None:
         """Store the line and the request. The first request is due at once.

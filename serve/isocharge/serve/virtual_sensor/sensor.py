@@ -77,7 +77,7 @@ class PseudoPort:
         return written_count == len(data)
 
     def discard_received(self) -> None:
-        """Discard the bytes that the connected program has sent. A full buffer would block a program that sends bytes."""
+        """Discard the bytes that the connected program has sent. A full buffer would block this program."""
         with contextlib.suppress(BlockingIOError):
             os.read(self._writer, PORT_BUFFER_BYTES)
 
