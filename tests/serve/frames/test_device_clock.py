@@ -99,6 +99,12 @@ def test_clock_of_16_bits_in_us_may_wrap_at_each_reading():
         assert time.device_us == t_us
 
 
+def test_clock_with_a_sign_may_begin_below_zero():
+    clock = DeviceClock()
+    frames = [read(clock, chunk_at(1e-6 * t_us), [t_us])[0] for t_us in range(-50_000, 50_000, 5000)]
+    assert [frame.dt_s for frame in frames[1:]] == [0.005] * 19
+
+
 def test_times_never_decrease():
     """Chunks of one to eight readings arrive with random delays. The device restarts once, after 7000 readings."""
     rng = np.random.default_rng(0)

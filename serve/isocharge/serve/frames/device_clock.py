@@ -185,7 +185,8 @@ class DeviceClock:
             largest_step_back_us = modulus // 2 if modulus > MAX_DELAY_s * 1e6 else 0
             step_us = (t_us - self._device_us + largest_step_back_us) % modulus - largest_step_back_us
         frame.is_clock_reset = step_us < -MAX_DELAY_s * 1e6
-        is_before_zero = self._device_us + step_us < 0  # before the device was started, which is not possible
+        # An unsigned clock is never below 0, where it would be before the start of the device. A signed clock may be.
+        is_before_zero = t_us >= 0 and self._device_us + step_us < 0
         if not self._has_fit or frame.is_clock_reset or is_before_zero:
             step_us = 0
             self._begin_fit(t_us, arrival_s)
