@@ -8,12 +8,14 @@ from itertools import count, islice
 import pytest
 
 from boards import encoded_frames, taps
+from isocharge.common.errors import PortError
 from isocharge.serve import (
     Chunk,
     Recorder,
     Recording,
     TouchStream,
     device_from_table,
+    stream,
 )
 from isocharge.serve.live.recorded_stream import RecordedStream, replay
 from isocharge.serve.port.recording import Marker
@@ -75,6 +77,16 @@ def test_replay_repeats_the_records_bit_for_bit(tmp_path, film, predictor):
     assert all(record["latency_us"] > 0 for record in records)
     assert [event.tare for event in Recording(path).events()].count(True) == 1
     assert replayed_lines(path, predictor) == lines
+
+
+def test_replay_with_the_right_description_yields_the_records_that_the_recording_lacks(tmp_path, film, predictor):
+    live = RecordedStream(TouchStream(predictor, device_from_table({"frames": {"format": "text"}}, "wrong")))
+    live.request_recording(Recorder(tmp_path / "wrong.rec", predictor.metadata.label, {}))
+    chunks = chunks_of_presses(film)
+    with pytest.raises(PortError):
+        list(live.follow(chunks))
+    replayed = list(replay(Recording(tmp_path / "wrong.rec"), TouchStream(predictor), yields_all=True))
+    assert len(replayed) == len(list(stream(chunks, predictor))) > 60
 
 
 @pytest.mark.parametrize("function", ["lseek", "write"])

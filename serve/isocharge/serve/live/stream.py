@@ -53,6 +53,7 @@ class ReadingStream:
     Attributes:
         parser: Parser that finds the frames in the bytes and counts them.
         clock: Clock of the device.
+        dropped_at_frame: Number of dropped bytes at the latest frame; infinite after a warning.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class ReadingStream:
         self._stages = create_stages(self._setup)
         self._pending_flags: list[str] = []  # flags that the next frame gets
         self._previous_values: tuple[float, ...] = ()
-        self._dropped_at_frame = 0.0  # number of dropped bytes at the latest frame; infinite after a warning
+        self.dropped_at_frame = 0.0
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
@@ -126,7 +127,7 @@ class ReadingStream:
             return frames
         parser = self.parser.recognised or self.parser  # the parser that has recognised the format continues alone
         self.parser = parser
-        self._dropped_at_frame = parser.counts.bytes_dropped
+        self.dropped_at_frame = parser.counts.bytes_dropped
         self.clock.stamp(chunk, frames, parser.t_us_modulus)
         for frame in frames:
             # The number of intervals since the previous frame is 1 plus the number of lost frames between them. The
@@ -160,12 +161,12 @@ class ReadingStream:
             NoFramesError: If the stream has contained no frame.
         """
         counts = self.parser.counts
-        dropped_bytes = counts.bytes_dropped - self._dropped_at_frame
+        dropped_bytes = counts.bytes_dropped - self.dropped_at_frame
         if dropped_bytes <= max_bytes:
             return
         line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
         if counts.frames:
-            self._dropped_at_frame = math.inf
+            self.dropped_at_frame = math.inf
             log.warning(
                 "no intact frame among the latest %d bytes%s; expected %s, as before: check the cable, and start again "
                 "if the board sends other frames now",
