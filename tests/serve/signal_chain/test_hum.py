@@ -36,6 +36,12 @@ def test_hum_is_gone_after_two_seconds(rate_Hz, frequency_Hz):
     assert np.abs(settled_pC).max() < max_residual_pC
 
 
+def test_noise_of_the_first_tare_contains_little_hum():
+    """The tare is measured in the first half second."""
+    raw_pC = np.random.default_rng(0).normal(0.0, 1.0, (100, 3)) + mains_hum(100, 200.0, 5.0)
+    assert without_hum(raw_pC, 200.0).std(axis=0).max() < 1.4
+
+
 def test_touch_passes_hum_removal_without_delay_and_ringing():
     """A fixed notch filter with a time constant of 0.5 s would ring with 11 pC after this step of 850 pC."""
     rate_Hz = 1000.0

@@ -17,7 +17,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Complexes
 from isocharge.serve.frames.frame import Frame
-from isocharge.serve.signal_chain.stage import Divisor, Rule, Setting, Setup, Stage
+from isocharge.serve.signal_chain.stage import Divisor, Rule, Setting, Setup, Stage, SUM_TOLERANCE_s
 
 MIN_SQUARED_STEP = 0.02
 """Smallest squared change of the unit phasor between two frames with which the hum is updated, dimensionless."""
@@ -65,8 +65,8 @@ class Hum(Stage):
         self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
         # The reference is the frame with which the next frame is compared: its unit phasor, its charges, and its age.
         self._reference_phasor = 0j
-        self._reference_pC: Array | None = None
         self._elapsed_s = 0.0
+        self.reset()
 
     def step(self, frame: Frame) -> None:
         """Subtract the hum from a frame, and update the estimate of the hum.
@@ -92,8 +92,11 @@ class Hum(Stage):
             # Clipping limits the influence of a touch, which may change the charges by more than the hum.
             clipped_error_pC = error_pC.clip(-rule.limit_pC, rule.limit_pC)
             # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only
-            # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`.
-            gain = min(1.0, 2.0 * self._elapsed_s / rule.settle_s)
+            # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`. Until this
+            # time has passed, the errors are averaged over the time so far, so that the first tare contains little hum.
+            self._learned_s += self._elapsed_s
+            averaging_s = max(min(rule.settle_s, self._learned_s), SUM_TOLERANCE_s)
+            gain = min(1.0, 2.0 * self._elapsed_s / averaging_s)
             correction_per_error = gain / squared_step * phasor_step.conjugate()
             self._phasor_pC = self._phasor_pC + clipped_error_pC * correction_per_error
         # The unit phasor turns enough within a tenth of a period, except if the frames are nearly whole periods apart.
@@ -105,8 +108,9 @@ class Hum(Stage):
         frame.charge_pC = raw_pC - (self._phasor_pC * unit_phasor).real
 
     def reset(self) -> None:
-        """Keep the estimate of the hum, but do not compare the next frame with an earlier one."""
-        self._reference_pC = None
+        """Learn the hum again, because the clock may have been reset. Compare the next frame with no earlier one."""
+        self._reference_pC: Array | None = None
+        self._learned_s = 0.0  # time over which the hum has been learned
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

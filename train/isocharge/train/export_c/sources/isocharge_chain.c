@@ -83,6 +83,7 @@ void isocharge_chain_tare(isocharge_chain *chain)
 #endif
 #if ISOCHARGE_HUM_ON
     chain->hum_running = 0;
+    chain->hum_learned_s = 0;
 #endif
 }
 
@@ -99,7 +100,10 @@ static void remove_hum(isocharge_chain *chain, const real raw_pC[N], real quiet_
 
     chain->hum_waited_s += dt_s;
     if (chain->hum_running && turned) {
-        const real share = smaller(1, 2 * chain->hum_waited_s / (real)ISOCHARGE_HUM_SETTLE_S) / norm;
+        real average_s, share;
+        chain->hum_learned_s += chain->hum_waited_s;
+        average_s = larger(smaller((real)ISOCHARGE_HUM_SETTLE_S, chain->hum_learned_s), (real)ISOCHARGE_SUM_TOLERANCE_S);
+        share = smaller(1, 2 * chain->hum_waited_s / average_s) / norm;
         EACH(k)
         {
             const real change = raw_pC[k] - chain->hum_raw_pC[k];

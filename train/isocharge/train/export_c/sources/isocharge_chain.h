@@ -45,6 +45,7 @@ typedef struct {
     isocharge_real turn_re, turn_im;                 /* the mains at the frame that is compared */
     isocharge_real hum_raw_pC[ISOCHARGE_ELECTRODES]; /* its charges */
     isocharge_real hum_waited_s;                     /* time since then */
+    isocharge_real hum_learned_s;                    /* time over which the hum has been learned */
     int hum_running;
 #endif
 #if ISOCHARGE_TARE_ON
@@ -77,7 +78,7 @@ typedef struct {
 /* The state before the first frame. */
 void isocharge_chain_start(isocharge_chain *chain);
 
-/* Tare again, however long that takes; what is known about hum stays. */
+/* Tare again, however long that takes, and learn the hum again. */
 void isocharge_chain_tare(isocharge_chain *chain);
 
 /* Take the next frame through all stages.
