@@ -76,6 +76,18 @@ def test_charge_survives_a_damaged_frame_in_a_rise(damage, predictor):
     np.testing.assert_allclose(last.charge_pC, current_pC.sum(axis=0), rtol=0.01)
 
 
+def test_noise_of_the_charges_grows_during_a_touch():
+    """Error of the charge, relative to its stated standard deviation, 1 and 8 s after the beginning of a touch."""
+    charge_pC = np.outer(np.arange(1300) >= 400, 1000.0 * RATIOS)
+    errors = []
+    for seed in range(6):
+        noise_pC = np.random.default_rng(seed).normal(0.0, 0.3, charge_pC.shape)
+        frames = StageRunner(8, front_end="current").run(np.diff(charge_pC, axis=0, prepend=0.0) + noise_pC, 100.0)
+        errors.append([(frame.charge_pC - charge_pC[-1]) / frame.noise_pC for frame in (frames[500], frames[1200])])
+    rms_errors = np.sqrt(np.mean(np.square(errors), axis=(0, 2)))
+    assert np.all((rms_errors > 0.7) & (rms_errors < 1.6))
+
+
 def test_many_missing_currents_cause_no_touch_and_give_a_touch_the_flag_gap():
     values = currents(100.0 * FORCE[:, None] * RATIOS)
     values[750:1250] = values[2000:2500] = math.nan  # at rest, and during the first press

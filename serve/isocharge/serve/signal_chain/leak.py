@@ -298,9 +298,10 @@ class Integrator(Leak):
         self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
         self._elapsed_s = 0.0  # time over which the mean sampling interval is computed
         self._interval_count = 1  # sampling intervals in this time, and one more, which avoids a division by 0
+        self._touch_count = 0  # sampling intervals of the present touch; 0 at rest
 
     def step(self, frame: Frame) -> None:
-        """Replace the currents by the charges, and the noise of the currents by the noise of the charges at rest.
+        """Replace the currents by the charges, and the noise of the currents by the noise of the charges.
 
         The current of a missing frame is assumed to be the mean of the currents before and after the gap. If this mean
         is so small that it may be only noise, the current is assumed to be the estimated offset (the inflow) instead.
@@ -310,6 +311,8 @@ class Integrator(Leak):
 
         At rest, the charges decay with the time constant `relax_s`. For currents that are independent and have the
         sampling interval dt, the variance of their sum is then relax_s / (2 dt) times the variance of one current.
+        During a touch of n currents, the charges do not decay, and each current adds its variance. The inflow is the
+        mean of the currents in the time T before the touch. Its error adds n^2 dt / T times this variance.
         """
         self._elapsed_s += frame.dt_s
         self._interval_count += frame.intervals
@@ -317,6 +320,8 @@ class Integrator(Leak):
         current_pC = frame.charge_pC
         if current_pC is None:
             return
+        is_touched = self._previous is not None and self._previous.is_contact
+        self._touch_count = self._touch_count + frame.intervals if is_touched else 0
 
         # Add the assumed charges of the missing frames. A current is the charge of one sampling interval.
         interval_s = max(self._elapsed_s / self._interval_count, SUM_TOLERANCE_s)  # mean sampling interval
@@ -333,10 +338,15 @@ class Integrator(Leak):
         # currents before and after the gap, each differs from their mean by at most half of their difference.
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0
         self._current_pC = current_pC
-        frame.noise_pC = frame.noise_pC * math.sqrt(max(1.0, 0.5 * self._rule.relax_s / interval_s))
+        current_noise_pC = frame.noise_pC
+        rest_ratio = max(1.0, 0.5 * self._rule.relax_s / interval_s)  # of the variances
+        frame.noise_pC = current_noise_pC * math.sqrt(rest_ratio)
         if self._is_large(error_pC, frame):
             self._is_falsified = True
             frame.flags.append(GAP)
+        averaging_s = max(min(self._rule.settle_s, self._inflow.learned_s), interval_s)
+        touch_ratio = self._touch_count + self._touch_count**2 * interval_s / averaging_s
+        frame.noise_pC = current_noise_pC * math.sqrt(rest_ratio + touch_ratio)
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the charge that has arrived, minus the charge that has leaked, shape (n_electrode,), pC."""

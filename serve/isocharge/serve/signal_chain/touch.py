@@ -149,7 +149,8 @@ class Touch(Stage):
         if self._rule is None:  # the detection is switched off, so every frame counts as a contact
             self._is_contact = True
         else:
-            if frame.noise_pC is not self._noise_pC:  # the film was tared
+            has_new_noise = frame.noise_pC is not self._noise_pC  # the film was tared, or the board sends currents
+            if has_new_noise and not self._is_contact:
                 self._noise_pC = frame.noise_pC
                 self._threshold_pC = self._rule.threshold_pC(frame.noise_pC)
             charge = frame.charge_pC / self._threshold_pC
