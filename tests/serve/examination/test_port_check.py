@@ -118,6 +118,13 @@ def test_check_reports_missing_settings(board, message):
     assert message in missing(examined(board, electrodes=FOUR))
 
 
+def test_settings_of_the_device_file_are_not_missing():
+    device = device_from_table({"leak": {"tau_s": 10.0}, "hum": {}}, "test")
+    report = examined(charges(hum=9.0, drift=-4.0), device=device, electrodes=("A", "B", "C"))
+    assert "hum" not in missing(report)
+    assert "drifts" not in missing(report)
+
+
 @pytest.mark.parametrize(
     ("encode", "settings", "is_missing"),
     [(LINES, {"device": AT_REST}, True), (LINES, {}, False), (encode_frame, {"device": AT_REST}, False)],

@@ -12,6 +12,7 @@ from isocharge.serve.examination.held_press import HeldPress
 from isocharge.serve.examination.listening import Capture, elapsed_times
 from isocharge.serve.port.source import has_speed
 from isocharge.serve.signal_chain.channels import Channels
+from isocharge.serve.signal_chain.hum import HumRule
 from isocharge.serve.signal_chain.leak import LeakRule
 from isocharge.serve.signal_chain.stage import LARGEST, Device, Setup
 from isocharge.serve.signal_chain.tare import TareRule
@@ -256,6 +257,8 @@ def channel_sentences(
         max_hum_pC: Largest harmless amplitude of hum, pC. The default is below the noise of the film.
     """
     rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
+    hum_rule = device.rule(HumRule)
+    removed_Hz = None if hum_rule is None else hum_rule.frequency_Hz  # frequency of the hum that the stream removes
     # A current of any size at rest is an offset.
     offset_limit_pC = math.inf if device.has_currents else rule.offset_limit_pC
     for channel in channels:
@@ -284,13 +287,13 @@ def channel_sentences(
                 f"{offset_limit_pC:g} pC: remove what lies on the film; if the amplifier rests at this value, "
                 "subtract it with [gain] offset, which --write puts into the device file"
             )
-        if abs(channel.drift_pC_per_s) > max_drift_pC_per_s:
+        if abs(channel.drift_pC_per_s) > max_drift_pC_per_s and device.rule(LeakRule) is None:
             yield (
                 f"{name} drifts by {channel.drift_pC_per_s:.2g} pC/s, so that an untouched film may seem touched: "
                 "let the amplifier warm up, or put [leak] with the time constants of the amplifiers into a device file"
             )
         for frequency_Hz, hum_pC in zip(MAINS_HZ, channel.hum_pC, strict=True):
-            if hum_pC is not None and hum_pC > max_hum_pC:
+            if hum_pC is not None and hum_pC > max_hum_pC and frequency_Hz != removed_Hz:
                 yield f"{name} has a hum of {hum_pC:.2g} pC: set [hum] frequency_Hz = {frequency_Hz:g} in a device file"
 
 

@@ -215,7 +215,8 @@ def examine_received(
     if not touch:
         missing += channel_sentences(channels, unit, device)
     if held_press.tau_s is not None:
-        table = {"leak": {"tau_s": held_press.tau_s}} | table  # keeps a section that the device file already has
+        leak = {"tau_s": held_press.tau_s} | table.get("leak", {})  # keeps settings that the device file already has
+        table = {**table, "leak": leak}
     first_frame = capture.frames[0]
     is_numbered = first_frame.seq is not None
     return replace(
