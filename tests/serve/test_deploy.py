@@ -4,7 +4,6 @@ import configparser
 import json
 import os
 import re
-import runpy
 import shlex
 import shutil
 import subprocess
@@ -68,47 +67,6 @@ def test_triton_serves_the_released_models(monkeypatch):
     with bench_http.running([python, DEPLOY / "triton/start.py", MODELS, "--port", str(address[1])], address):
         assert_golden(f"127.0.0.1:{address[1]}")
     assert {path: path.stat().st_mtime_ns for path in MODELS.rglob("*")} == before
-
-
-def test_triton_is_started_with_the_backend_for_onnx_beside_its_own(monkeypatch, tmp_path):
-    """From a stand-in for the wheel."""
-    started = []
-    server = tmp_path / "pytriton/tritonserver"
-    stub = "triton_python_backend_stub"
-    for file in (
-        "../__init__.py",
-        "backends/python/model.py",
-        "python_backend_stubs/{}.{}/".format(*sys.version_info) + stub,
-    ):
-        (server / file).parent.mkdir(parents=True, exist_ok=True)
-        (server / file).touch()
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    monkeypatch.setattr(sys, "argv", ["start.py", str(MODELS), "--port", "8080", "--grpc-port", "8081"])
-    monkeypatch.setattr(os, "execve", lambda *call: started.append(call))
-    runpy.run_path(str(DEPLOY / "triton/start.py"), run_name="__main__")
-    ((program, words, environment),) = started
-    given = dict(word.removeprefix("--").split("=") for word in words[1:])
-    folder = Path(given.pop("backend-directory"))
-    assert {str(path.relative_to(folder)) for path in folder.rglob("*.*")} == {
-        "python/model.py",
-        "onnxruntime/model.py",
-    }
-    assert program == words[0] == str(server / "bin/tritonserver")
-    assert (folder / "python" / stub).is_file()
-    assert given == {
-        "model-repository": str(MODELS.resolve()),
-        "http-address": "127.0.0.1",
-        "http-port": "8080",
-        "allow-metrics": "false",
-        "grpc-address": "127.0.0.1",
-        "grpc-port": "8081",
-    }
-    libraries, packages = (environment[name].split(":")[0] for name in ("LD_LIBRARY_PATH", "PYTHONPATH"))
-    assert (libraries, packages) == (str(tmp_path / "nvidia_pytriton.libs"), str(tmp_path))
-    shutil.rmtree(server / "python_backend_stubs")
-    with pytest.raises(SystemExit, match="does not support Python"):
-        runpy.run_path(str(DEPLOY / "triton/start.py"), run_name="__main__")
 
 
 # systemd

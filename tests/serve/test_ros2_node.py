@@ -117,25 +117,6 @@ def test_the_node_publishes_flags_and_diagnostics_once_a_second(run_node, record
     assert (values["records"], values["gap"], values["invalid"]) == ("3", "2", "1")
 
 
-def test_the_check_of_topics_accepts_the_messages_of_the_node_and_finds_faults(run_node, record):
-    press = {"y_mm": -2.5, "force_N": 0.75, "x_std_mm": 0.05, "y_std_mm": 0.06, "flags": ("tare",)}
-    messages = {}
-    for topic, data in run_node([record(**press)]):
-        kind = {"wrench": "WrenchStamped", "pose": "PoseWithCovarianceStamped", "flags": "String"}.get(topic[11:])
-        kind = kind or "DiagnosticArray"
-        messages.setdefault(topic, []).append(ROS.deserialize_cdr(data, f"{KINDS[kind]}/msg/{kind}"))
-    problems = runpy.run_path(str(NODE.parents[2] / "check_topics.py"))["problems"]
-    assert problems(messages) == []
-    messages["/isocharge/wrench"][0].wrench.torque.x *= -1.0
-    messages["/isocharge/flags"].clear()
-    assert problems(messages) == ["/isocharge/flags: expected messages, got none"]
-    messages["/isocharge/flags"].append(SimpleNamespace(data=""))
-    assert [one.split(":")[0].split(" at ")[0] for one in problems(messages)] == [
-        "torque of the wrench",
-        "/isocharge/flags",
-    ]
-
-
 def test_the_node_publishes_what_an_mcap_file_holds(run_node, record):
     press = {
         "y_mm": -2.5,

@@ -112,13 +112,3 @@ def test_deflection_that_the_page_draws_is_near_that_of_the_solver(changes, larg
     for (distance_mm, force_N), result in zip(presses, results, strict=True):
         expected = deflection(press(film, Circle(1.0), (distance_mm, 0.0), force_N), places)
         assert np.abs(np.array(result) - expected).max() < largest_error * expected.max()
-
-
-def test_page_reads_a_token_with_a_percent_sign_as_it_is():
-    """A server accepts no such token, so the page then asks for another one."""
-    token = node(
-        f"""globalThis.location = {{ hash: "#100%" }};
-        const {{ Connection }} = await import("{(VIEWER / "page/connection.js").as_uri()}");
-        console.log(JSON.stringify(new Connection({{}}).token));"""
-    )
-    assert token == "100%"

@@ -22,16 +22,11 @@ def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, b
     errors = ErrorMap(PRESSES, np.ones(5), np.array([0.1, 0.2, 0.1, 3.0, 0.3]))
     case = DesignCase(SENSOR, 3, 4.0, nuisances=nuisances)
     figure = error_maps_picture(Design(case, SENSOR, "", 0, errors if before else None, errors))
-    *maps, colour_bar = figure.axes
-    colour_bar.set_ylim(2e-4, 2e-2)
-    assert "0.0005" in [label.get_text() for label in colour_bar.get_yticklabels()]
-    assert figure.get_size_inches().tolist() == [13.8 if before else 7.4, 6.0]
+    *maps, _colour_bar = figure.axes
     assert (len(maps), known in figure.get_suptitle()) == (1 + before, True)
     for axes in maps:
         assert [line.get_xydata().tolist() for line in axes.lines] == [[[2.0, 4.0]]]
         assert "worst 3 mm (cross), rms 1.35 mm" in axes.get_title()
-        assert axes.get_xlim()[1] > 10.2  # the outermost corners of the electrodes
-        assert axes.get_ylim()[0] < -11.5
         (shades,) = axes.collections
         assert (type(shades.norm), *shades.get_clim()) == (LogNorm, 0.1, 1.0)
 
