@@ -153,14 +153,14 @@ class Bench:
 def follower_after(predictor: Predictor, touches: np.ndarray) -> FilmFollower:
     """Return a follower that has observed touches frame by frame, 100 frames per second, a second between touches."""
     follower = FilmFollower(Setup(predictor.metadata.electrodes, predictor=predictor))
-    clock_s = 0.0
+    host_s = 0.0
     for charges in touches:
         for charge_pC in charges:
             # Every frame counts, whatever its flags, because the figures apply to touches all over the film.
             follower._peak.add_frame(predictor.predict(charge_pC), charge_pC)
-            clock_s += 0.01
-        follower.step(Frame(None, None, (), clock_s=clock_s))
-        clock_s += 1.0
+            host_s += 0.01
+        follower.step(Frame(None, None, (), host_s=host_s))
+        host_s += 1.0
     return follower
 
 

@@ -91,6 +91,16 @@ def test_noise_of_a_device_file_and_at_rest_widens_the_contacts_of_a_stream_and_
     assert json.loads(out)["x_std_mm"] == pytest.approx(expected.x_std_mm, rel=1e-5)
 
 
+def test_contact_contains_the_error_of_the_warming(released):
+    frame = Frame(None, None, (), charge_pC=PRESS_pC, is_contact=True, warming_error_pC=np.full(4, 5.0))
+    frame.noise_pC = np.zeros(4)
+    (prediction,) = create_stages(Setup(released.metadata.electrodes, predictor=released), needs_contact=True)
+    prediction.step(frame)
+    drawn_pC = PRESS_pC + np.random.default_rng(0).normal(0.0, 5.0, (2000, 1))
+    spread = np.std(np.asarray(released.predict_batch(drawn_pC)), axis=0)[:3]
+    np.testing.assert_allclose(frame.contact[3:6], np.hypot(released.predict(PRESS_pC)[3:6], spread), rtol=0.1)
+
+
 def test_warming_is_estimated_with_the_noise_of_the_device_file(released):
     stream = TouchStream(released, device_from_table({"noise": {"gain": 0.015}, "common_mode": {}}, "b"))
     stream.use(released)

@@ -115,8 +115,8 @@ def followed(model, charge, rng, frames=2, noise=NOISE):
     for number, row in enumerate(charge):
         mean_charge = noise.add(np.tile(row, (frames, 1)), rng).mean(axis=0)
         contact = model.predict(mean_charge)
-        follower.step(Frame(None, None, (), clock_s=number, charge_pC=mean_charge, contact=contact))
-        follower.step(Frame(None, None, (), clock_s=number + 0.04))
+        follower.step(Frame(None, None, (), host_s=number, charge_pC=mean_charge, contact=contact))
+        follower.step(Frame(None, None, (), host_s=number + 0.04))
         was_lost.append(follower.is_lost)
     return follower, was_lost
 
@@ -199,6 +199,17 @@ def test_stated_uncertainty_contains_the_change_as_long_as_the_touches_show_litt
     assert np.mean(np.array(deviations) < 2.0) > 0.9
 
 
+def test_a_night_without_power_makes_the_pretension_uncertain_again(series, model):
+    rng = np.random.default_rng(0)
+    _, charge = touches(series, [0.0, 0.0, 0.0], rng, 31)
+    follower, _ = followed(model, charge[:30], rng)
+    std_MPa = follower.film.pretension_std_MPa
+    for host_s, is_touched in ((4e4, True), (4e4 + 0.04, False)):
+        contact = model.predict(charge[30]) if is_touched else None
+        follower.step(Frame(None, None, (), host_s=host_s, charge_pC=charge[30], contact=contact))
+    assert 1.5 * std_MPa < follower.film.pretension_std_MPa < series.tension_std_MPa
+
+
 def test_nearly_slack_film_that_has_not_changed_is_not_lost(tmp_path):
     """The pretension is 0.01 MPa and cannot become smaller."""
     rng = np.random.default_rng(2)
@@ -231,7 +242,7 @@ def test_stage_corrects_and_flags_contacts_and_counts_a_touch_with_invalid_frame
     for is_lost in (False, True):
         stage.is_lost = is_lost
         for number in range(52):
-            frame = Frame(None, None, (), clock_s=100.0 + 0.01 * number, is_valid=number % 20 != 10)
+            frame = Frame(None, None, (), host_s=100.0 + 0.01 * number, is_valid=number % 20 != 10)
             if frame.is_valid and number < 50:
                 frame.charge_pC = charge[20]
                 frame.set_contact(raw, model.validity)

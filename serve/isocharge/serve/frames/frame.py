@@ -89,6 +89,8 @@ class Frame:
         is_contact: Whether something touches the film.
         warming_pC: Part of the charges that is due to a warming of the film since the previous frame, shape
             (n_electrode,) or one number for all electrodes, pC. This part was subtracted from `charge_pC`.
+        warming_error_pC: Charges that one standard deviation of the estimated warming adds, shape (n_electrode,), pC;
+            None if no warming is estimated.
         base_relax_s: Time constant with which the charge out of contact decays to zero, s.
         is_base_held: Whether the tare follows the charge at rest and the warming. If so, the base of the touch
             detection does not decay as long as the base is the charge that remains of the latest touch.
@@ -121,6 +123,7 @@ class Frame:
     noise_pC: Array = field(init=False, repr=False, compare=False)
     is_contact: bool = False
     warming_pC: Array | float = 0.0
+    warming_error_pC: Array | None = None
     base_relax_s: float = math.inf
     is_base_held: bool = False
     contact: Contact | None = None

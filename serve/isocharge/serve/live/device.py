@@ -72,9 +72,7 @@ def predictor_for(device: Device, predictor: Predictor) -> Predictor:
 class Prediction(Stage):
     """Predicts the contact of each frame with the present model, for the noise that the device file states.
 
-    If the noise at rest before a touch is much larger, the standard deviations of the touch are computed for this
-    noise. A small difference has no effect, because the tare measures the noise with few frames and therefore
-    inaccurately.
+    If the noise at rest is much larger, the standard deviations are computed for the noise at rest.
     """
 
     section = "noise"
@@ -87,27 +85,27 @@ class Prediction(Stage):
 
         A contact is valid within the working area and the forces of this predictor.
         """
+        self._setup = setup
         self._predictor = predictor_for(setup.device, setup.model)
         setup.predictor = self._predictor
-        self._touch_predictor: Predictor | None = None  # for the noise before the present touch
 
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges.
 
-        In the first frame of a touch, the predictor of the touch is chosen. If the noise at rest is much larger than
-        the noise of the model, the standard deviations of the touch are computed for the noise at rest.
+        The predictor for the noise at rest is stored in the setup for the later stages. The error of an estimated
+        warming is added to the uncertainty of the contact.
         """
         if frame.charge_pC is None or not frame.is_contact:
-            self._touch_predictor = None
             return
-        if self._touch_predictor is None:
-            self._touch_predictor = self._predictor
-            # The tare measures the noise at rest inaccurately. A noise up to 1.5 times that of the model has no effect.
-            noise = self._predictor.noise
-            if np.any(frame.noise_pC > 1.5 * np.asarray(noise.white_pC)):
-                white_pC = np.maximum(frame.noise_pC, noise.white_pC)
-                self._touch_predictor = self._predictor.with_noise(white_pC, noise.gain)
-        frame.contact, frame.contact_flags = self._touch_predictor.predict_with_flags(frame.charge_pC)
+        predictor = self._predictor.for_noise_at_rest(frame.noise_pC)
+        self._setup.predictor = predictor
+        frame.contact, frame.contact_flags = predictor.predict_with_flags(frame.charge_pC)
+        if frame.warming_error_pC is not None:
+            # The contact changes by half of the difference between the contacts of raised and of lowered charges.
+            changed_pC = frame.charge_pC + np.outer([1.0, -1.0], frame.warming_error_pC)
+            raised, lowered = np.asarray(predictor.predict_batch(changed_pC), float)[:, :3]
+            change = 0.5 * (raised - lowered)  # of x, y and the force
+            frame.contact = frame.contact.with_error(np.outer(change, change))
 
 
 STAGES: tuple[type[Stage], ...] = (

@@ -60,6 +60,15 @@ class Contact(NamedTuple):
     xF_correlation: float = math.nan
     yF_correlation: float = math.nan
 
+    def with_error(self, covariance: Array) -> "Contact":
+        """Return the contact with an uncertainty that includes an additional independent error.
+
+        Args:
+            covariance: Covariance of the additional error of x, y and the force, shape (3, 3), mm and N.
+        """
+        (values,) = add_covariance(np.array([self], np.float32), covariance[np.newaxis])
+        return Contact(*values.tolist())
+
     def __repr__(self) -> str:
         """Return a text with x, y, the force and their standard deviations, rounded to a few significant digits."""
         return (

@@ -107,6 +107,19 @@ class Predictor:
         new_predictor.__dict__.update(self.__dict__, noise=noise, validity=validity)
         return new_predictor
 
+    def for_noise_at_rest(self, noise_pC: Array) -> "Predictor":
+        """Return a predictor for the noise at rest if this noise is much larger than the stated noise, otherwise self.
+
+        A noise up to 1.5 times the stated noise has no effect, because a tare measures the noise inaccurately.
+
+        Args:
+            noise_pC: Standard deviation of the charges without a touch, shape (n_electrode,), pC.
+        """
+        white_pC = np.asarray(self.noise.white_pC)
+        if np.any(noise_pC > 1.5 * white_pC):
+            return self.with_noise(np.maximum(noise_pC, white_pC), self.noise.gain)
+        return self
+
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how `copy` and `pickle` create the predictor again, because an onnxruntime session cannot be copied.
 

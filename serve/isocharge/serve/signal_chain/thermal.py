@@ -104,9 +104,10 @@ class Warming(Stage):
             return
         if SATURATED in frame.flags:
             return
-        change_pC = self._estimate(frame.charge_pC, frame.dt_s) * self._ratios
+        change_pC = self._estimate(frame, frame.charge_pC) * self._ratios
         frame.charge_pC = frame.charge_pC - change_pC
         frame.warming_pC = change_pC
+        frame.warming_error_pC = math.sqrt(self._variance_pC2) * self._ratios
         if frame.is_base_held and frame.tare_pC is not None:  # the warming is a part of the tare
             frame.tare_pC = frame.tare_pC + change_pC
         if abs(self._charge_pC) >= self._rule.tell_pC:
@@ -114,7 +115,7 @@ class Warming(Stage):
         if self._is_blind:
             frame.flags.append(BLIND)
 
-    def _estimate(self, charge_pC: Array, dt_s: float) -> float:
+    def _estimate(self, frame: Frame, charge_pC: Array) -> float:
         """Update the estimate of the charge p that warming has added to each electrode, and return its change, pC.
 
         A Kalman filter computes the estimate (`_charge_pC`) and its variance (`_variance_pC2`). A change of p is
@@ -124,11 +125,11 @@ class Warming(Stage):
         distinguished from force. The estimate is then not changed.
 
         Args:
-            charge_pC: Touch charges from which the present estimate has been subtracted, shape (n_electrode,), pC.
-            dt_s: Time since the previous frame, s.
+            frame: The frame.
+            charge_pC: Its touch charges, from which the present estimate has been subtracted, shape (n_electrode,), pC.
         """
         rule = self._rule
-        self._waited_s += dt_s
+        self._waited_s += frame.dt_s
         if self._waited_s < rule.every_s - SUM_TOLERANCE_s:  # no estimate in this frame
             return 0.0
         # The common charge changes like a random walk, whose variance increases in proportion to the time.
@@ -137,7 +138,8 @@ class Warming(Stage):
 
         # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
         trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * self._ratios  # shape (trials, n_electrode)
-        squared_misfits = np.square(self._setup.model.predict_batch(trial_charges_pC).misfit, dtype=float)
+        predictor = self._setup.model.for_noise_at_rest(frame.noise_pC)
+        squared_misfits = np.square(predictor.predict_batch(trial_charges_pC).misfit, dtype=float)
         _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
 
         # The variance of the minimum is the inverse of the curvature, because the misfit is in standard deviations.

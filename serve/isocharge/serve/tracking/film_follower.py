@@ -43,7 +43,7 @@ from isocharge.common.errors import ModelError
 from isocharge.serve.flags import BEYOND, FILM, GAP, MISFIT, OUTSIDE, REPEAT, STRESS
 from isocharge.serve.frames.frame import Frame
 from isocharge.serve.model.charge_file import FILE, read_charge_map
-from isocharge.serve.model.contact import Contact, add_covariance, is_close
+from isocharge.serve.model.contact import Contact, is_close
 from isocharge.serve.model.robust_estimate import ModelValues, RobustProblem
 from isocharge.serve.record.record import FollowedFilm
 from isocharge.serve.signal_chain.stage import Rule, Setting, Setup, Stage
@@ -200,7 +200,6 @@ class FilmFollower(Stage):
     """Estimates the changes of one film, and corrects contacts for the estimated changes.
 
     Attributes:
-        predictor: Model of the calibrated film.
         is_lost: Whether the film is lost.
     """
 
@@ -230,7 +229,7 @@ class FilmFollower(Stage):
                 "film is followed from a model that `isocharge train calibrate` made of presses on it: calibrate it "
                 "with this version"
             )
-        self.predictor = predictor
+        self._setup = setup  # contains the model of the calibrated film, for the noise of the present touch
         self._rule = setup.device.rule(FollowRule) or FollowRule()
         self._series = series
         # Charge that warmth adds to each electrode, relative to the common offset, shape (n_electrode,)
@@ -280,7 +279,7 @@ class FilmFollower(Stage):
         """Present estimate of the film, in the format of a prediction record."""
         change_MPa = 0.0 if self._applied_state is None else float(self._applied_state[0])
         std_MPa = math.sqrt(self._applied_covariance[0, 0])
-        return FollowedFilm(self._series.pretension_MPa + change_MPa, std_MPa, self._touch_count)
+        return FollowedFilm(float(self._series.pretension_MPa) + change_MPa, std_MPa, self._touch_count)
 
     def step(self, frame: Frame) -> None:
         """Correct the contact with the estimate from the earlier touches, and update the estimate when a touch ends.
@@ -292,7 +291,7 @@ class FilmFollower(Stage):
         if frame.contact is not None and frame.charge_pC is not None:
             corrected_contact = self.follow_contact(frame.contact, frame.charge_pC)
             # The corrected contact is a contact on the calibrated film, so the limits of this film apply.
-            frame.set_contact(corrected_contact, self.predictor.validity)
+            frame.set_contact(corrected_contact, self._setup.model.validity)
             all_flags = (*frame.flags, *frame.contact_flags)
             self._peak.add_frame(corrected_contact, frame.charge_pC, all_flags)  # averages the strongest frames
             if self.is_lost:
@@ -301,9 +300,9 @@ class FilmFollower(Stage):
             mean_charge_pC = self._peak.mean_charge_pC
             self.reset()
             if mean_charge_pC is not None:
-                self._observe_touch(mean_charge_pC, frame.clock_s)
+                self._observe_touch(mean_charge_pC, frame.host_s)
 
-    def _observe_touch(self, charge_pC: Array, clock_s: float) -> None:
+    def _observe_touch(self, charge_pC: Array, host_s: float) -> None:
         """Update the estimate of the film with a touch, and decide whether the film is lost.
 
         The charges of a touch have three errors: their noise, the part of the charges that the charge map does not
@@ -313,12 +312,13 @@ class FilmFollower(Stage):
 
         Args:
             charge_pC: Average touch charges near the largest force, shape (n_electrode,), pC.
-            clock_s: Time of the touch, s.
+            host_s: Time of the touch, unix seconds. The clock of the board would not count while the board is off.
         """
         # Increase the variances, because the film may have changed since the previous touch.
-        elapsed_hours = max(clock_s - self._latest_touch_s, 0.0) / 3600.0
-        self._latest_touch_s = clock_s
-        self._covariance[0, 0] += self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
+        elapsed_hours = max(host_s - self._latest_touch_s, 0.0) / 3600.0
+        self._latest_touch_s = host_s
+        drift_variance = self._rule.drift_MPa_per_root_hour**2 * elapsed_hours
+        self._covariance[0, 0] = min(self._covariance[0, 0] + drift_variance, self._initial_std[0] ** 2)
         # Each touch also restores a small part of the variance that earlier touches have removed.
         lost_variance = np.maximum(self._initial_std**2 - self._covariance.diagonal(), 0.0)
         lost_variance[self._directions] = 0.0  # a film keeps these properties
@@ -327,12 +327,12 @@ class FilmFollower(Stage):
         # Compute the covariance of the three errors of the charges.
         touch_offset_pC = self._offset_std_pC * self._offset_ratio
         model_error_pC = self._series.charge_std * charge_pC
-        variance_pC2 = self.predictor.noise.variance(charge_pC) + model_error_pC**2
+        variance_pC2 = self._setup.model.noise.variance(charge_pC) + model_error_pC**2
         scale = self._error_scale
         covariance_pC2 = scale * (np.diag(variance_pC2) + np.outer(touch_offset_pC, touch_offset_pC))
 
         # Estimate the state together with the contact of the touch. The former state is the prior.
-        start = self._log_contact(self.follow_contact(self.predictor.predict(charge_pC), charge_pC))
+        start = self._log_contact(self.follow_contact(self._setup.model.predict(charge_pC), charge_pC))
         problem = RobustProblem(
             self._values, charge_pC[np.newaxis], covariance_pC2[np.newaxis], self._state, self._covariance
         )
@@ -453,12 +453,11 @@ class FilmFollower(Stage):
             # A conversion at the given contact yields this contact roughly. The result is used again while the given
             # contact hardly changes.
             rough_conversion = self._conversion_at(contact, state)
-            corrected = self.predictor.predict(charge_pC + rough_conversion.shift_pC)
+            corrected = self._setup.model.predict(charge_pC + rough_conversion.shift_pC)
             conversion = self._conversion_at(corrected, state)._replace(contact=contact)
             self._conversion = conversion
-        followed = self.predictor.predict(charge_pC + conversion.shift_pC)
-        (values,) = add_covariance(np.array([followed], np.float32), conversion.covariance[np.newaxis])
-        return Contact(*values.tolist())
+        followed = self._setup.model.predict(charge_pC + conversion.shift_pC)
+        return followed.with_error(conversion.covariance)
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
         """Return the conversion from charges of the changed film to charges of the calibrated film, near a contact.
@@ -476,7 +475,7 @@ class FilmFollower(Stage):
 
         # An error of the state shifts the contact whose charges are nearest to the converted charges (least squares).
         # The distance of charges is measured in standard deviations of their noise.
-        noise_std_pC = np.sqrt(self.predictor.noise.variance(calibrated_pC))
+        noise_std_pC = np.sqrt(self._setup.model.noise.variance(calibrated_pC))
         weight = 1.0 / noise_std_pC[:, None]
         contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * changed.by_state[0])  # shape (3, n_state)
         contact_by_state[2] *= contact.force_N  # from ln F to F

@@ -131,7 +131,7 @@ class Tracker(Stage):
                 # The mixture does not use the predicted contacts. Its contacts are therefore valid wherever the file
                 # describes the charges, and not only in the working area of the model.
                 validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
-                self._new_filter = partial(ContactMixture, charges, predictor.noise, validity)
+                self._new_filter = lambda: ContactMixture(charges, setup.model.noise, validity)
         self._time_s = 0.0  # time of the latest valid frame on a clock that is never set back
         self._events: TouchEvents | None = None  # None without a touch
         self.reset()
