@@ -131,7 +131,7 @@ NOISE_LEVELS = {
 """Noise model of each noise level.
 
 The level `reference` is an assumption. The proportional noise of the level `measured` comes from the data set
-Tactile_Heatmaps of the University of Genoa: in 1,171 recordings, the charge of a PVDF channel varies by at most 2 % at
+Tactile_Heatmaps of the University of Genoa: in 1,171 recordings, the charge of a PVDF channel varies by about 2 % at
 equal force. For the levels `bench` and `surgery`, the noise model is the part of the disturbances that does not depend
 on earlier readings.
 """

@@ -12,7 +12,7 @@ from isocharge.serve.benchmark import in_process_contenders, machine, press_char
 
 def bench_command(
     model: Annotated[
-        str, typer.Argument(metavar="[MODEL]", help="Model: a name in `models/`, or a path.")
+        str, typer.Argument(metavar="[MODEL]", help="Name of a model, or path of a model folder.")
     ] = "three-25um-biaxial",
     seconds: Annotated[float, typer.Option(min=0.1, max=86400.0, help="Time for all measurements, s.")] = 10.0,
     models: ModelsOption = None,

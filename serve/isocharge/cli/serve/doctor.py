@@ -58,7 +58,8 @@ def doctor_command(
         typer.Option(
             "--pc-per-unit",
             metavar="NUMBER|A=..,B=..",
-            help="Charge of one unit that the board sends, pC; for the device file. (default: asked for)",
+            help="Charge of one unit that the board sends, pC; needed for the device file if the board does not "
+            "send pC. (default: unknown)",
         ),
     ] = None,
     request: Annotated[

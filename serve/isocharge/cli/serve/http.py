@@ -35,7 +35,10 @@ log.setLevel(logging.INFO)
 def http_command(
     models: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder of the models to serve. (default: all in the usual places)"),
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the models to serve. (default: all in $ISOCHARGE_MODELS, `models` and the installation)",
+        ),
     ] = None,
     host: Annotated[
         str,

@@ -207,7 +207,7 @@ def stream_command(
         typer.Option(
             "--follow",
             help="Follow the film's pretension by ordinary touches, as by [follow]: records get `film`. Needs four "
-            "electrodes and a model of `train calibrate`. (default: off)",
+            "electrodes or more, and a model of `train calibrate`. (default: off)",
         ),
     ] = False,
     live: LiveOption = None,

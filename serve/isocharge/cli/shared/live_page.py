@@ -36,7 +36,8 @@ LiveOption = Annotated[
     typer.Option(
         metavar="[HOST:]PORT",
         help="Show the film on a page for browsers at this address. A port alone is a port of this machine, and port 0 "
-        "chooses a free port. An address that other machines can reach needs --token. (default: no page)",
+        "chooses a free port. An address that other machines can reach needs --token; the page asks for the "
+        "token, or takes it from #TOKEN in its address. (default: no page)",
     ),
 ]
 
@@ -47,8 +48,7 @@ TokenOption = Annotated[
         # If the variable is empty, the token is an empty text, which `AccessCheck` refuses. Typer alone would treat an
         # empty token as a missing token.
         callback=lambda token: os.environ.get("ISOCHARGE_TOKEN") if token is None else token,
-        help="Secret that clients must send as `Authorization: Bearer TOKEN`; the live page asks for it, or takes it "
-        "from #TOKEN in its address. (default: none)",
+        help="Secret that clients must send as `Authorization: Bearer TOKEN`. (default: none)",
     ),
 ]
 

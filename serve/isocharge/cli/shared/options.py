@@ -51,7 +51,7 @@ NoiseOption = Annotated[
     typer.Option(
         metavar="LEVEL|FILE.toml",
         help="Noise of the readings: reference (1 pC and 0.2 %, assumed), measured (1 pC and 1.5 %), bench, surgery, "
-        "or a TOML file with white_pC and proportional.",
+        "or a TOML file with white_pC and proportional. Only the white and the proportional noise count.",
     ),
 ]
 

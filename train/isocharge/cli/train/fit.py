@@ -63,7 +63,7 @@ def fit_command(
     force_std: ForceStdOption = 0.01,
     config: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Training settings, TOML. (default: those of the released models)"),
+        typer.Option(metavar="FILE", help="Training settings, TOML. (default: those of train/configs/default.toml)"),
     ] = None,
     version: Annotated[
         int, typer.Option(min=1, help="Version of the model, which is the name of the folder in models/NAME.")
