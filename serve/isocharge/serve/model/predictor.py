@@ -116,7 +116,7 @@ class Predictor:
             noise_pC: Standard deviation of the charges without a touch, shape (n_electrode,), pC.
         """
         white_pC = np.asarray(self.noise.white_pC)
-        if np.any(noise_pC > 1.5 * white_pC):
+        if (noise_pC > 1.5 * white_pC).any():
             return self.with_noise(np.maximum(noise_pC, white_pC), self.noise.gain)
         return self
 

@@ -14,7 +14,6 @@ of assumptions about these facts is a hypothesis. The evidence of a hypothesis f
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import compress, groupby, product
 from typing import NamedTuple
 
@@ -232,13 +231,10 @@ def _estimate_with_errors(
     is_bad = _find_bad_presses(data.redundancy, found.chi2)
     is_used = ~is_bad
 
-    # Linearise the charges at the point that was found, and average over the hypotheses. Repeat this at the average. If
-    # the evidence is smaller there, the charges are too nonlinear, and the second average is discarded.
-    average_estimates = partial(_average_estimates, charges, stated[is_used], data[is_used], prior)
-    average = average_estimates(all_hypotheses, found.state, found.contacts[is_used])
-    second_average = average_estimates(average.hypotheses, average.unknowns, average.log_contact)
-    if second_average.largest_log_evidence >= average.largest_log_evidence:
-        average = second_average
+    # Linearise the charges at the point that was found, and average over the hypotheses.
+    average = _average_estimates(
+        charges, stated[is_used], data[is_used], prior, all_hypotheses, found.state, found.contacts[is_used]
+    )
 
     # Compute the residuals of all presses, also of the bad ones, whose contacts remain those that were found.
     log_contact = found.contacts.copy()
@@ -312,7 +308,6 @@ class _Average(NamedTuple):
         hypotheses: Hypotheses whose weight is not negligible.
         weight: Weight of each hypothesis in `hypotheses`, proportional to its evidence, shape (n_hypothesis,).
         chi2: Smallest sum of squared residuals under each hypothesis in `hypotheses`, shape (n_hypothesis,).
-        largest_log_evidence: Logarithm of the largest evidence among the hypotheses.
         unknowns: Weighted mean of the unknowns, shape (n_unknown,), within their bounds.
         covariance: Covariance of the unknowns, shape (n_unknown, n_unknown).
         log_contact: Contacts (x, y, ln F) that agree best with the mean unknowns, shape (n, 3).
@@ -323,7 +318,6 @@ class _Average(NamedTuple):
     hypotheses: list[Hypothesis]
     weight: Array
     chi2: Array
-    largest_log_evidence: float
     unknowns: Array
     covariance: Array
     log_contact: Array
@@ -387,7 +381,6 @@ def _average_estimates(
         hypotheses=probable,
         weight=weight,
         chi2=all_chi2[is_probable],
-        largest_log_evidence=log_evidence.max(),
         unknowns=np.clip(mean, *prior.bounds),
         covariance=covariance,
         log_contact=log_contact + contact_change,
