@@ -22,12 +22,13 @@ from isocharge.simulate import (
 from isocharge.simulate.forward.readout import (
     MAP_COUNTS,
     NEAR_DISTANCE,
-    STRESS_WEIGHTS,
     ElectrodePieces,
+    charge_per_stress_of_pieces,
     contact_charges,
     stress_charge,
     thermal_charge,
 )
+from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.numerics.polygon import to_corners
 from solved_charges import with_film, with_piezo
 
@@ -43,7 +44,7 @@ TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
     pieces = ElectrodePieces.of(sensor)
-    charge_per_stress = STRESS_WEIGHTS[sensor.readout] * sensor.piezo.charge_per_stress
+    charge_per_stress = charge_per_stress_of_pieces(sensor)
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(PROBE, np.zeros(1), (per_side, per_side)):
         values = np.stack(np.broadcast_arrays(*stress(rule.points.real, rule.points.imag)))
@@ -220,9 +221,10 @@ def test_thermal_charge():
     np.testing.assert_allclose(thermal_charge(sensor, 0.1), [-27.0, 0.5 * -24.0], rtol=1e-12)
 
 
-def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension():
-    """A film that cannot expand has the plane stress -E alpha / (1 - nu) per kelvin in all directions."""
-    sensor = with_film(with_piezo(UNIAXIAL, pyro=-30.0), expansion=(1e-4, 1e-4))
-    stress = -sensor.film.young * 1e-4 / (1.0 - sensor.film.poisson)  # MPa/K
-    expected = 9.0 * 0.5 * (-30.0 + (20.0 + 2.0) * stress)
+@pytest.mark.parametrize(("readout", "d12"), [("area", 5.0), ("edge", 0.0)])
+def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension(readout, d12):
+    """The film cannot expand. The edge readout ignores d12."""
+    film = replace(UNIAXIAL.film, expansion=(1e-4, -1e-5), axis=0.4)
+    sensor = replace(with_piezo(UNIAXIAL, pyro=-30.0, d12=5.0), film=film, readout=readout)
+    expected = 9.0 * (-30.0 * 0.5 + [20.0, 2.0, 2.0 * d12] @ tension_change(film, 0.5, 0.0))
     np.testing.assert_allclose(thermal_charge(sensor, 0.5), np.full(4, expected), rtol=1e-12)
