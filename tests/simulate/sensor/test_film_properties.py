@@ -64,11 +64,13 @@ def test_all_moduli_change_with_the_modulus_of_the_film():
     assert changed.film.shear == pytest.approx(0.5 * default.film.young / (1.0 + default.film.poisson))
 
 
-def test_even_film_keeps_the_axis_of_its_shear_modulus():
-    orthotropic = with_film(SENSOR, young_ratio=1.5, axis=0.6, shear=700.0)
-    prior = FilmPrior(orthotropic, PROBE)
-    even = prior.film(prior.without_imperfections(prior.mean))[0].film
-    assert (even.young_ratio, even.axis, even.shear) == (1.0, 0.6, 700.0)
+@pytest.mark.parametrize("change", [0.0, 1e-9, -0.2])
+def test_film_keeps_the_axis_of_its_shear_modulus_so_that_its_stiffness_changes_continuously(change):
+    prior = FilmPrior(with_film(SENSOR, young_ratio=1.5, axis=0.6, shear=700.0), PROBE)
+    even, _ = prior.film(prior.without_imperfections(prior.mean))
+    film = changed_film(even, PROBE, {"stiffness_x": change})[0].film
+    expected_ratio = math.exp(change * math.cos(1.2))
+    assert (film.young_ratio, film.axis, film.shear) == pytest.approx((expected_ratio, 0.6, 700.0), rel=1e-12)
 
 
 def test_all_properties_are_tested():

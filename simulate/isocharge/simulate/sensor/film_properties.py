@@ -23,7 +23,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.film import Film, add_axial
+from isocharge.simulate.sensor.film import Film, add_anisotropy, add_axial
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Sensor, outermost_corner
@@ -184,11 +184,10 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
     pretension = value_of[PRETENSION.name]
     difference, shear = film.deviator
     stiffness_change = complex(value_of["stiffness_x"], value_of["stiffness_xy"])
-    log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, stiffness_change)
     oval_change = complex(value_of["oval_x"], value_of["oval_xy"])
     oval, oval_axis = add_axial(film.oval, film.oval_axis, oval_change)
     return replace(
-        film,
+        add_anisotropy(film, stiffness_change),
         pretension=pretension,
         young=film.young * math.exp(value_of["young"]),
         thickness=film.thickness * math.exp(value_of["thickness"]),
@@ -197,8 +196,6 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
             shear + value_of["tension_shear"] * pretension,
         ),
         shear=None if film.shear is None else film.shear * math.exp(value_of["young"]),
-        young_ratio=math.exp(log_ratio),
-        axis=axis,
         oval=oval,
         oval_axis=oval_axis,
     )
