@@ -218,6 +218,7 @@ BAD = [
     ("simulate identify SENSOR --noise clean", "expected white noise above 0 pC, got that of 'clean'"),
     ("simulate identify SENSOR --error 0", "--error"),
     ("simulate identify SENSOR --force 1 1", "a smaller and a larger force"),
+    ("simulate sweep SENSOR --radius auto --force 0.5 0.5 -o OUT", "a smaller and a larger force"),
     ("simulate design SENSOR --electrodes 2 --radius 8 -o OUT", "three unknowns"),
     ("simulate design SENSOR --electrodes 3 --probe triangle:3 --radius 8 -o OUT", "expected circle:RADIUS"),
     ("train fit -o OUT", "InputError: expected either a DATASET folder or --sensor SENSOR"),
