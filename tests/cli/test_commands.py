@@ -25,7 +25,7 @@ from isocharge.common.errors import InputError
 from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import find_model, load_model
-from isocharge.simulate import ForwardMap, Sweep, load_sensor
+from isocharge.simulate import ForwardMap, Resolution, SolveSettings, Sweep, load_sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from kept import ROOT
 from whole_films import build_from_default_map
@@ -177,6 +177,17 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     path.write_text(path.read_text().replace("pyro_uC_per_m2_K = -30.0", ""))
     without_pyro, _ = point(command, path, "--temperature", 0.1)
     assert "--temperature changes no charge" in without_pyro["warnings"][-1]
+
+
+def test_temperature_step_changes_the_stress_that_a_static_pressure_causes(command, tmp_path, monkeypatch):
+    """A slack film that bulges under 10 Pa is cooled by 1 K. Its pretension alone changes the charge by 65.5 pC."""
+    path = sensor_file(tmp_path)
+    text = path.read_text()
+    path.write_text(text.replace("[film]", "[film]\nstatic_pressure_Pa = 10.0\nexpansion_ppm_per_K = 100.0"))
+    coarse = SolveSettings(resolution=Resolution(4, 8, 4))
+    monkeypatch.setattr("isocharge.cli.simulate.point.SolveSettings", lambda **_: coarse)
+    cooled, _ = point(command, path, "--force", 1e-3, "--temperature", -1.0)
+    assert cooled["charge_pC"]["B"] == pytest.approx(30.28, rel=0.02)
 
 
 @pytest.mark.slow

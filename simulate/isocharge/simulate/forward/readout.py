@@ -322,6 +322,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
 
     The charge contains the pyroelectric charge of a free film. If the film has expansion coefficients, its pretension
     changes as well, because the temperature of the ring remains constant. The charge that this change causes is added.
+    The result does not contain the change of the stress that a static pressure causes.
 
     Args:
         sensor: Sensor with the electrodes, the film and its coefficients.
