@@ -182,8 +182,8 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
 def test_temperature_step_changes_the_stress_that_a_static_pressure_causes(command, tmp_path, monkeypatch):
     """A slack film that bulges under 10 Pa is cooled by 1 K. Its pretension alone changes the charge by 65.5 pC."""
     path = sensor_file(tmp_path)
-    text = path.read_text()
-    path.write_text(text.replace("[film]", "[film]\nstatic_pressure_Pa = 10.0\nexpansion_ppm_per_K = 100.0"))
+    properties = "[film]\nstatic_pressure_Pa = 10.0\nexpansion_ppm_per_K = 100.0"
+    path.write_text(path.read_text().replace("[film]", properties))
     coarse = SolveSettings(resolution=Resolution(4, 8, 4))
     monkeypatch.setattr("isocharge.cli.simulate.point.SolveSettings", lambda **_: coarse)
     cooled, _ = point(command, path, "--force", 1e-3, "--temperature", -1.0)
