@@ -122,7 +122,7 @@ def test_sweep_writes_its_presses_and_warns_of_the_stress(command, tmp_path, mon
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
     assert f"300 presses in {tmp_path / 'presses'}" in err
-    assert "caution: 1 N under circle:1.0 stress the film to 48.9 MPa, the limit is 45 MPa" in err
+    assert "caution: 1 N under circle:1.0 stress the film to 48.9 MPa at the centre, the limit is 45 MPa" in err
 
 
 class Terminal(io.StringIO):
@@ -228,7 +228,6 @@ BAD = [
     ("simulate sweep SENSOR --radius all -o OUT", "expected a number of mm or 'auto', got 'all'"),
     ("simulate identify SENSOR --noise clean", "expected white noise above 0 pC, got that of 'clean'"),
     ("simulate identify SENSOR --error 0", "--error"),
-    ("simulate identify SENSOR --force 1 1", "a smaller and a larger force"),
     ("simulate sweep SENSOR --radius auto --force 0.5 0.5 -o OUT", "a smaller and a larger force"),
     ("simulate design SENSOR --electrodes 2 --radius 8 -o OUT", "three unknowns"),
     ("simulate design SENSOR --electrodes 3 --probe triangle:3 --radius 8 -o OUT", "expected circle:RADIUS"),

@@ -56,7 +56,7 @@ def test_each_property_changes_what_it_names_and_nothing_else(name):
     assert len([key for key in described if changed[key] != described[key]]) == 1
 
 
-@pytest.mark.parametrize("change", [0.0, 1e-9, -0.2])
+@pytest.mark.parametrize("change", [1e-9, -0.2])
 def test_shear_modulus_keeps_its_axis_and_changes_with_the_modulus_of_the_film(change):
     """A small change of the stiffness must not turn the axis."""
     prior = FilmPrior(with_film(SENSOR, young_ratio=1.5, axis=0.6, shear=700.0), PROBE)
