@@ -35,7 +35,12 @@ from isocharge.simulate.forward.family import (
     relative_error,
     spread_check_presses,
 )
-from isocharge.simulate.forward.readout import ChargeDensity, ElectrodePieces, charge_per_stress_of_pieces, contact_charges
+from isocharge.simulate.forward.readout import (
+    ChargeDensity,
+    ElectrodePieces,
+    charge_per_stress_of_pieces,
+    contact_charges,
+)
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared, rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.oval import film_oval

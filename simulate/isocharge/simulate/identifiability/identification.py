@@ -304,13 +304,11 @@ def map_to_search(
             "force: expected a smaller and a larger force, which determine how the charges change, "
             f"got {min_force:g} N twice"
         )
-    if radius is not None:
-        return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-
-    first_radius = search_radius(sensor, probe.under(max_force))
-    radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
-    *larger_radii, smallest_radius = radii.tolist()
-    for radius in larger_radii:
-        with suppress(SolveError):
-            return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-    return ForwardMap.build(sensor, probe, smallest_radius, force_range, executor=executor)
+    if radius is None:
+        first_radius = search_radius(sensor, probe.under(max_force))
+        radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
+        *larger_radii, radius = radii.tolist()  # the map with the smallest radius is built last
+        for larger_radius in larger_radii:
+            with suppress(SolveError):
+                return ForwardMap.build(sensor, probe, larger_radius, force_range, executor=executor)
+    return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
