@@ -25,7 +25,7 @@ from isocharge.common.errors import InputError
 from isocharge.common.progress import report, track
 from isocharge.common.toml_text import to_toml
 from isocharge.serve import find_model, load_model
-from isocharge.simulate import ForwardMap, Sweep, load_sensor
+from isocharge.simulate import ForwardMap, Resolution, SolveSettings, Sweep, load_sensor
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict
 from kept import ROOT
 from whole_films import build_from_default_map
@@ -122,7 +122,7 @@ def test_sweep_writes_its_presses_and_warns_of_the_stress(command, tmp_path, mon
     code, _, err = command(*SMALL, *words, "-o", tmp_path / "presses")
     assert code == 0
     assert f"300 presses in {tmp_path / 'presses'}" in err
-    assert "caution: 1 N under circle:1.0 stress the film to 48.9 MPa, the limit is 45 MPa" in err
+    assert "caution: 1 N under circle:1.0 stress the film to 48.9 MPa at the centre, the limit is 45 MPa" in err
 
 
 class Terminal(io.StringIO):
@@ -179,6 +179,17 @@ def test_a_point_warns_and_adds_a_temperature_step(command, tmp_path):
     assert "--temperature changes no charge" in without_pyro["warnings"][-1]
 
 
+def test_temperature_step_changes_the_stress_that_a_static_pressure_causes(command, tmp_path, monkeypatch):
+    """A slack film that bulges under 10 Pa is cooled by 1 K. Its pretension alone changes the charge by 65.5 pC."""
+    path = sensor_file(tmp_path)
+    properties = "[film]\nstatic_pressure_Pa = 10.0\nexpansion_ppm_per_K = 100.0"
+    path.write_text(path.read_text().replace("[film]", properties))
+    coarse = SolveSettings(resolution=Resolution(4, 8, 4))
+    monkeypatch.setattr("isocharge.cli.simulate.point.SolveSettings", lambda **_: coarse)
+    cooled, _ = point(command, path, "--force", 1e-3, "--temperature", -1.0)
+    assert cooled["charge_pC"]["B"] == pytest.approx(30.28, rel=0.02)
+
+
 @pytest.mark.slow
 def test_fit_says_folds_and_prints_json(command, tmp_path, monkeypatch):
     """The map of three electrodes on a uniaxial film folds within 8 mm. The command prints a warning."""
@@ -217,7 +228,7 @@ BAD = [
     ("simulate sweep SENSOR --radius all -o OUT", "expected a number of mm or 'auto', got 'all'"),
     ("simulate identify SENSOR --noise clean", "expected white noise above 0 pC, got that of 'clean'"),
     ("simulate identify SENSOR --error 0", "--error"),
-    ("simulate identify SENSOR --force 1 1", "a smaller and a larger force"),
+    ("simulate sweep SENSOR --radius auto --force 0.5 0.5 -o OUT", "a smaller and a larger force"),
     ("simulate design SENSOR --electrodes 2 --radius 8 -o OUT", "three unknowns"),
     ("simulate design SENSOR --electrodes 3 --probe triangle:3 --radius 8 -o OUT", "expected circle:RADIUS"),
     ("train fit -o OUT", "InputError: expected either a DATASET folder or --sensor SENSOR"),

@@ -22,12 +22,13 @@ from isocharge.simulate import (
 from isocharge.simulate.forward.readout import (
     MAP_COUNTS,
     NEAR_DISTANCE,
-    STRESS_WEIGHTS,
     ElectrodePieces,
+    charge_per_stress_of_pieces,
     contact_charges,
     stress_charge,
     thermal_charge,
 )
+from isocharge.simulate.mechanics.warming import tension_change
 from isocharge.simulate.numerics.polygon import to_corners
 from solved_charges import with_film, with_piezo
 
@@ -43,7 +44,7 @@ TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
     pieces = ElectrodePieces.of(sensor)
-    charge_per_stress = STRESS_WEIGHTS[sensor.readout] * sensor.piezo.charge_per_stress
+    charge_per_stress = charge_per_stress_of_pieces(sensor)
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(PROBE, np.zeros(1), (per_side, per_side)):
         values = np.stack(np.broadcast_arrays(*stress(rule.points.real, rule.points.imag)))
@@ -210,19 +211,14 @@ def test_contact_charges_of_many_presses_are_those_of_each_press():
     np.testing.assert_allclose(contact_charges(sensor, probe, contact, orientation), expected)
 
 
-def test_thermal_charge():
-    """A coefficient of -30 uC/(m^2 K) gives -27 pC on 9 mm^2 for a temperature step of 0.1 K.
+@pytest.mark.parametrize(("readout", "d12"), [("area", 5.0), ("edge", 0.0)])
+def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension(readout, d12):
+    """The pyroelectric charge of a free film is -15 pC/mm^2. The square T has 4 mm^2 and a gain of 0.5.
 
-    The triangle has an area of 8 mm^2, and its gain is 0.5.
+    The edge readout ignores d12.
     """
-    electrodes = (SQUARE, TRIANGLE)
-    sensor = replace(with_piezo(UNIAXIAL, pyro=-30.0), electrodes=electrodes, calibration=Calibration(gain={"T": 0.5}))
-    np.testing.assert_allclose(thermal_charge(sensor, 0.1), [-27.0, 0.5 * -24.0], rtol=1e-12)
-
-
-def test_thermal_charge_of_a_clamped_film_contains_the_charge_of_its_changed_tension():
-    """A film that cannot expand has the plane stress -E alpha / (1 - nu) per kelvin in all directions."""
-    sensor = with_film(with_piezo(UNIAXIAL, pyro=-30.0), expansion=(1e-4, 1e-4))
-    stress = -sensor.film.young * 1e-4 / (1.0 - sensor.film.poisson)  # MPa/K
-    expected = 9.0 * 0.5 * (-30.0 + (20.0 + 2.0) * stress)
-    np.testing.assert_allclose(thermal_charge(sensor, 0.5), np.full(4, expected), rtol=1e-12)
+    electrodes = (SQUARE, Electrode.of_square("T", (-10.0, 4.0), 2.0))
+    sensor = replace(with_piezo(UNIAXIAL, pyro=-30.0, d12=5.0), electrodes=electrodes, readout=readout)
+    clamped = with_film(replace(sensor, calibration=Calibration(gain={"T": 0.5})), expansion=(1e-4, -1e-5), axis=0.4)
+    density = -15.0 + [D31, D32, 2.0 * d12] @ tension_change(clamped.film, 0.5, 0.0)
+    np.testing.assert_allclose(thermal_charge(clamped, 0.5), [9.0 * density, 2.0 * density], rtol=1e-12)

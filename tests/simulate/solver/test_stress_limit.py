@@ -58,9 +58,8 @@ def test_yield_force_of_a_single_force_that_stresses_the_film_too_much():
     assert yield_force(FILM, [TIP], (0.05, 0.05)) is None
 
 
-@pytest.mark.parametrize(("force", "stress"), [(1.0, 48.8), (2.0, 74.3)])
-def test_probe_of_1_mm_exceeds_the_yield_stress_of_pvdf(force, stress):
-    largest = largest_stress(FILM, TIP, force)
-    assert largest == pytest.approx(stress, rel=3e-3)
-    assert f"{force:g} N under circle:1.0 stress the film to {largest:.3g} MPa" in stress_caution(FILM, TIP, force)
-    assert not stress_caution(FILM, TIP, 0.4 * force)
+def test_probe_of_1_mm_exceeds_the_yield_stress_of_pvdf():
+    largest = largest_stress(FILM, TIP, 1.0)
+    assert largest == pytest.approx(48.8, rel=3e-3)
+    assert f"1 N under circle:1.0 stress the film to {largest:.3g} MPa at the centre" in stress_caution(FILM, TIP, 1.0)
+    assert not stress_caution(FILM, TIP, 0.4)

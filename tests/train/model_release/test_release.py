@@ -152,7 +152,7 @@ def test_the_folder_is_complete_and_its_card_and_metadata_agree(released, datase
     assert f"{metadata.errors['position_median_mm']:g} mm" in card
     assert "| noise `reference` | 1 pC and 0.2 % |" in card
     assert "Three charges nearly always fit some contact." in card
-    assert f"beyond {metadata.yield_force_N:g} N the film is stressed to more than 45 MPa" in card
+    assert f"beyond {metadata.yield_force_N:g} N at the centre, the stress exceeds 45 MPa" in card
     percentages = re.findall(r"\| (?:coverage|detected).* \| (\S+)% \|", card)
     names = ["coverage_68", "coverage_95", "found_gain_20_percent", "found_dead_electrode"]
     expected_fractions = [metadata.errors[name] for name in names]

@@ -88,7 +88,7 @@ def sweep_radius(
 
     radii = []
     for probe in probes:
-        forward_map = map_to_search(sensor, probe, force, executor)  # covers the largest possible working area
+        forward_map = map_to_search(sensor, probe, force, executor=executor)  # covers the largest possible working area
         area = working_area(ChargeSpline.of(forward_map), noise or noise_model("reference"))
         say(f"{probe.notation}: {area.summary}")
         radii.append(area.radius)

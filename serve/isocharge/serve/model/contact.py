@@ -295,7 +295,7 @@ class Validity:
         corners_mm: Corners of the polygon that is the working area, shape (n, 2), mm.
         force_range_N: Smallest and largest force, N.
         misfit_limit: Misfit above which the charges are not attributed to a single contact, in standard deviations.
-        yield_force_N: Force above which the film yields, N.
+        yield_force_N: Force above which the film yields at the centre, N.
         white_pC: Standard deviation of the white noise, pC: one number for all electrodes, or one number for each
             electrode.
     """

@@ -138,8 +138,8 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         errors: Measured errors by name. Each name contains the unit.
         made_with: Command and package versions with which the model was made.
         format_version: Version of the format of the metadata.
-        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
-            or above the range of forces.
+        yield_force_N: Force at which the film yields at the centre under the sharpest of the probes, N. None if the
+            force is unknown or above the range of forces.
         unnoticed: Shares of presses outside the working area whose contact is wrong without a flag. None if the shares
             were not measured.
     """

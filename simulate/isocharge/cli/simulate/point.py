@@ -1,5 +1,6 @@
 """Command `isocharge simulate point`, which computes the charges and the deflection of one press."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Annotated
 
@@ -88,9 +89,14 @@ def point_command(
         applied_side_force = friction_force(equilibrium, friction)
         equilibrium = press(film, footprint, position, force, settings, side_force=applied_side_force)
 
+    # Charges are relative to the film before the contact and the warming. A static pressure also stretches this film.
+    rest = equilibrium.rest
+    if temperature and film.static_pressure:
+        rest = press(unwarmed_sensor.film, footprint, position, force, settings).rest
+
     # Collect the results.
     warming_charge = thermal_charge(film_sensor, temperature)
-    charge = touch_charge(film_sensor, equilibrium) + warming_charge
+    charge = touch_charge(film_sensor, replace(equilibrium, rest=rest)) + warming_charge
     charge_pC = dict(zip(film_sensor.electrode_names, charge.tolist(), strict=True))
     results = {"charge_pC": charge_pC, **summary(equilibrium, partial(stress_charge, film_sensor))}
     if any(applied_side_force):

@@ -77,6 +77,15 @@ The edge readout has two kinds of pieces: lines on the left and right edges, and
 """
 
 
+def charge_per_stress_of_pieces(sensor: Sensor) -> Array:
+    """Return the charge density per stress (s11, s22, s12) for each kind of piece, shape (n_kind, 3), pC/N.
+
+    Args:
+        sensor: Sensor with the readout and the piezoelectric coefficients.
+    """
+    return STRESS_WEIGHTS[sensor.readout] * sensor.piezo.charge_per_stress
+
+
 class PieceRule(NamedTuple):
     """Integration points for pairs of a press and a piece of an electrode.
 
@@ -258,7 +267,7 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
         Charges, shape (n_electrode,), pC.
     """
     pieces = ElectrodePieces.of(sensor)
-    charge_per_stress = STRESS_WEIGHTS[sensor.readout] * sensor.piezo.charge_per_stress
+    charge_per_stress = charge_per_stress_of_pieces(sensor)
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
         # `touch_stress` expects one list of points.
@@ -313,6 +322,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
 
     The charge contains the pyroelectric charge of a free film. If the film has expansion coefficients, its pretension
     changes as well, because the temperature of the ring remains constant. The charge that this change causes is added.
+    The result does not contain the change of the stress that a static pressure causes.
 
     Args:
         sensor: Sensor with the electrodes, the film and its coefficients.
@@ -323,7 +333,8 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
         Charges, shape (n_electrode,), pC. They are proportional to the areas of the electrodes.
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
-    tension_charge = sensor.piezo.charge_per_stress @ tension_change(sensor.film, step, 0.0)  # pC/mm^2
+    charge_per_stress = charge_per_stress_of_pieces(sensor).sum(axis=0)  # an electrode has pieces of each kind
+    tension_charge = charge_per_stress @ tension_change(sensor.film, step, 0.0)  # pC/mm^2
     return sensor.calibration.read(sensor.gains * areas * (sensor.piezo.pyro * step + tension_charge))
 
 

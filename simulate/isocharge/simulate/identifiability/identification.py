@@ -234,20 +234,9 @@ def identify(
             a press in the domain cannot exist.
         SolveError: If a press has no equilibrium, or the interpolation error of the forward map is too large.
     """
-    check_electrode_count(len(sensor.electrodes))
-    smallest_force, largest_force = force_range
-    if smallest_force == largest_force:
-        raise SceneError(
-            "force: expected a smaller and a larger force, which determine how the charges change, "
-            f"got {smallest_force:g} N twice"
-        )
     noise = noise or noise_model("reference")
     noise.check_white()
-    if radius is None:
-        forward_map = map_to_search(sensor, probe, force_range, executor)
-    else:
-        forward_map = ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-
+    forward_map = map_to_search(sensor, probe, force_range, radius, executor=executor)
     identification = Identification.of(forward_map, noise, error=error)
     area_radius = identification.area.radius
     mirror = mirror_region(sensor, probe, identification.charges, area_radius, noise, executor=executor)
@@ -280,31 +269,46 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
 
 
 def map_to_search(
-    sensor: Sensor, probe: Probe, force_range: tuple[float, float], executor: Executor | None = None
+    sensor: Sensor,
+    probe: Probe,
+    force_range: tuple[float, float],
+    radius: float | None = None,
+    *,
+    executor: Executor | None = None,
 ) -> ForwardMap:
     """Build the forward map that the search for the working area uses.
 
-    The first radius of the map is `search_radius`. If the charges cannot be interpolated accurately up to this radius,
-    the radius is multiplied by `RADIUS_REDUCTION`, at most `MAX_REDUCTIONS` times.
+    If no radius is given, the first radius of the map is `search_radius`. If the charges cannot be interpolated
+    accurately up to this radius, the radius is multiplied by `RADIUS_REDUCTION`, at most `MAX_REDUCTIONS` times.
 
     Args:
         sensor: Sensor of the forward map.
         probe: Probe that presses the film.
         force_range: Smallest and largest force, N.
+        radius: Radius of the map, mm; None to choose the radius.
         executor: Executor that runs the solves; None to run the solves in this process.
 
     Returns:
-        The forward map with the largest tried radius at which the charges can be interpolated accurately.
+        The forward map with the given radius, or else with the largest tried radius at which the charges can be
+        interpolated accurately.
 
     Raises:
-        SceneError: If a press in the domain cannot exist.
+        SceneError: If there are fewer than three electrodes, if the forces are equal, or if a press in the domain
+            cannot exist.
         SolveError: If even the map with the smallest radius cannot be built.
     """
-    _, max_force = force_range
-    first_radius = search_radius(sensor, probe.under(max_force))
-    radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
-    *larger_radii, smallest_radius = radii.tolist()
-    for radius in larger_radii:
-        with suppress(SolveError):
-            return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)
-    return ForwardMap.build(sensor, probe, smallest_radius, force_range, executor=executor)
+    check_electrode_count(len(sensor.electrodes))
+    min_force, max_force = force_range
+    if min_force == max_force:
+        raise SceneError(
+            "force: expected a smaller and a larger force, which determine how the charges change, "
+            f"got {min_force:g} N twice"
+        )
+    if radius is None:
+        first_radius = search_radius(sensor, probe.under(max_force))
+        radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
+        *larger_radii, radius = radii.tolist()  # the map with the smallest radius is built last
+        for larger_radius in larger_radii:
+            with suppress(SolveError):
+                return ForwardMap.build(sensor, probe, larger_radius, force_range, executor=executor)
+    return ForwardMap.build(sensor, probe, radius, force_range, executor=executor)

@@ -259,7 +259,8 @@ def find_ambiguous_pairs(
 
     # Select the pairs whose positions are distant, and whose charges agree within the noise. The results of searches
     # that find the first contact again are thus discarded.
-    distance = np.linalg.norm(second[:, :, :2] - first[:, :, :2], axis=2)  # shape (n, STARTS), mm
+    second_position = second[:, :, :2]
+    distance = np.linalg.norm(second_position - first[:, :, :2], axis=2)  # shape (n, STARTS), mm
     position_std = limits_at(charge_map, contact, noise).position  # of an estimated position, shape (n,), mm
     min_distance = min(MIN_DISTANCE, MIN_RELATIVE_DISTANCE * domain_radius)
     min_distance_of_contact = np.maximum(min_distance, MIN_DISTANCE_SIGMAS * position_std)
@@ -268,7 +269,7 @@ def find_ambiguous_pairs(
     is_ambiguous = is_distant & (charge_difference < INDISTINGUISHABLE_SIGMAS)
 
     # Several searches of a first contact often find the same second contact, which counts once.
-    is_ambiguous &= ~_is_repeated(second[:, :, :2], is_ambiguous, position_std)
+    is_ambiguous &= ~_is_repeated(second_position, is_ambiguous, position_std)
     pairs = AmbiguousPairs(first[is_ambiguous], second[is_ambiguous], charge_difference[is_ambiguous])
     order = np.argsort(pairs.outer_radius, kind="stable")
     return AmbiguousPairs(pairs.first[order], pairs.second[order], pairs.charge_difference[order])

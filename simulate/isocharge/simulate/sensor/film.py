@@ -300,3 +300,22 @@ def add_axial(size: float, axis: float, addition: complex) -> tuple[float, float
     if abs(total) < 1e-12 * abs(size):
         return 0.0, axis
     return abs(total), 0.5 * cmath.phase(total)
+
+
+def add_anisotropy(film: Film, addition: complex) -> Film:
+    """Change the anisotropy of the stiffness of a film.
+
+    If the shear modulus of the film is given, the film keeps its axis, because the shear modulus refers to this axis.
+    Only the component of the addition along the axis then changes the film.
+
+    Args:
+        film: Film that is changed.
+        addition: Second anisotropy that is added to the anisotropy of the film. An anisotropy is a complex number with
+            the magnitude ln(E1 / E2). Its argument is twice the angle from the x axis to axis 1.
+    """
+    log_ratio = math.log(film.young_ratio)
+    if film.shear is None:
+        log_ratio, axis = add_axial(log_ratio, film.axis, addition)
+        return replace(film, young_ratio=math.exp(log_ratio), axis=axis)
+    log_ratio += (addition * cmath.rect(1.0, -2.0 * film.axis)).real
+    return replace(film, young_ratio=math.exp(log_ratio))

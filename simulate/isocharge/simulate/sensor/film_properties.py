@@ -22,8 +22,8 @@ from functools import cached_property
 import numpy as np
 
 from isocharge.common.arrays import Array, Booleans
-from isocharge.common.errors import SceneError, SensorError
-from isocharge.simulate.sensor.film import Film, add_axial
+from isocharge.common.errors import SensorError
+from isocharge.simulate.sensor.film import Film, add_anisotropy, add_axial
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import Circle
 from isocharge.simulate.sensor.sensor import Calibration, Sensor, outermost_corner
@@ -183,22 +183,18 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
     """
     pretension = value_of[PRETENSION.name]
     difference, shear = film.deviator
-    stiffness_change = complex(value_of["stiffness_x"], value_of["stiffness_xy"])
-    log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, stiffness_change)
-    oval_change = complex(value_of["oval_x"], value_of["oval_xy"])
-    oval, oval_axis = add_axial(film.oval, film.oval_axis, oval_change)
+    young_factor = math.exp(value_of["young"])
+    oval, oval_axis = add_axial(film.oval, film.oval_axis, complex(value_of["oval_x"], value_of["oval_xy"]))
     return replace(
-        film,
+        add_anisotropy(film, complex(value_of["stiffness_x"], value_of["stiffness_xy"])),
         pretension=pretension,
-        young=film.young * math.exp(value_of["young"]),
+        young=film.young * young_factor,
         thickness=film.thickness * math.exp(value_of["thickness"]),
         deviator=(
             difference + value_of["tension_difference"] * pretension,
             shear + value_of["tension_shear"] * pretension,
         ),
-        shear=None if film.shear is None else film.shear * math.exp(value_of["young"]),
-        young_ratio=math.exp(log_ratio),
-        axis=axis,
+        shear=None if film.shear is None else film.shear * young_factor,
         oval=oval,
         oval_axis=oval_axis,
     )
@@ -373,8 +369,6 @@ class FilmPrior:
         Raises:
             SensorError: If the sensor cannot exist, for example because an electrode lies over the rim.
         """
-        if len(values) != len(self.properties):
-            raise SceneError(f"expected {len(self.properties)} values ({', '.join(self.names)}), got {len(values)}")
         return changed_film(self.sensor, self.probe, dict(zip(self.names, np.asarray(values).tolist(), strict=True)))
 
     def draw(self, rng: np.random.Generator, count: int) -> Array:

@@ -47,7 +47,7 @@ from isocharge.common.errors import SceneError
 from isocharge.simulate.mechanics.theory import bending_stiffness, elasticity, side_force_unit
 from isocharge.simulate.mesh.placed_mesh import PlacedMesh
 from isocharge.simulate.mesh.placement import Placement
-from isocharge.simulate.sensor.film import Surface, add_axial, check_range
+from isocharge.simulate.sensor.film import Surface, add_anisotropy, check_range
 from isocharge.simulate.sensor.footprint import Probe
 from isocharge.simulate.sensor.probe import RoundProbe
 from isocharge.simulate.solver.assembly import SolveTangent, factor_tangent, single_threaded_blas
@@ -106,12 +106,8 @@ def _add_stiffness(solved: Equilibrium, log_ratio: float, angle: float) -> Equil
         log_ratio: ln(E1 / E2) of the second anisotropy.
         angle: Angle from the direction of the press to axis 1 of the second anisotropy, rad.
     """
-    # An anisotropy is a complex number with the magnitude ln(E1 / E2). Its argument is twice the angle from the x axis
-    # to axis 1. The sum of both numbers is the new anisotropy.
     film = solved.film
-    addition = cmath.rect(log_ratio, 2.0 * (solved.direction + angle))
-    new_log_ratio, axis = add_axial(math.log(film.young_ratio), film.axis, addition)
-    changed_film = replace(film, young_ratio=math.exp(new_log_ratio), axis=axis)
+    changed_film = add_anisotropy(film, cmath.rect(log_ratio, 2.0 * (solved.direction + angle)))
     groups = replace(
         solved.groups,
         elasticity=elasticity(changed_film, solved.direction),

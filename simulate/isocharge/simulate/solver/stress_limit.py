@@ -43,7 +43,9 @@ def largest_stress(film: Film, probe: Probe, force: float) -> float:
 
 
 def stress_caution(film: Film, probe: Probe, force: float) -> str:
-    """Return a warning if the stress under a press exceeds `DEFAULT_STRESS_LIMIT`, and an empty string otherwise.
+    """Return a warning if a press at the centre stresses the film to more than `DEFAULT_STRESS_LIMIT`.
+
+    Otherwise, return an empty string. Near the clamp, the stress can exceed the limit without a warning.
 
     Args:
         film: The film.
@@ -58,13 +60,13 @@ def stress_caution(film: Film, probe: Probe, force: float) -> str:
     if stress <= DEFAULT_STRESS_LIMIT:
         return ""
     return (
-        f"{force:.3g} N under {probe.notation} stress the film to {stress:.3g} MPa, the limit is "
-        f"{DEFAULT_STRESS_LIMIT:.3g} MPa; PVDF yields at 45 to 55 MPa, and a dent stays"
+        f"{force:.3g} N under {probe.notation} stress the film to {stress:.3g} MPa at the centre, the "
+        f"limit is {DEFAULT_STRESS_LIMIT:.3g} MPa; PVDF yields at 45 to 55 MPa, and a dent stays"
     )
 
 
 def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tuple[float, float]) -> float:
-    """Compute the largest force of a range at which the stress in the film does not exceed a limit.
+    """Compute the largest force of a range with which a press at the centre does not stress the film beyond a limit.
 
     The equation ln(stress / limit) = 0 is solved for the logarithm of the force by Brent's method, which does not leave
     the range. The relative error of the force is below 0.1 %.
@@ -87,7 +89,7 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
     if smallest_stress > limit:
         raise SceneError(
             f"stress limit: expected more than {smallest_stress:.3g} MPa, which {min_force:.3g} N under "
-            f"{probe.notation} make in this film, got {limit:.3g} MPa"
+            f"{probe.notation} make at its centre, got {limit:.3g} MPa"
         )
     if largest_stress(film, probe, max_force) <= limit:
         return max_force
@@ -102,9 +104,9 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
 
 
 def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, float]) -> float | None:
-    """Compute the smallest force at which the film yields under any of several probes.
+    """Compute the smallest force with which any of several probes makes the film yield at the centre.
 
-    The film yields if its stress exceeds `DEFAULT_STRESS_LIMIT`.
+    The film yields if its stress exceeds `DEFAULT_STRESS_LIMIT`. Near the clamp, the film yields with a smaller force.
 
     Args:
         film: The film.

@@ -112,7 +112,7 @@ def fit_command(
         training_data = TrainingData.of(read_dataset(dataset))
         electrodes = training_data.sensor.electrode_names
         if training_data.yield_force_N is not None:
-            say(f"caution: PVDF yields beyond {training_data.yield_force_N:g} N, and a dent stays")
+            say(f"caution: PVDF yields beyond {training_data.yield_force_N:g} N at the centre, and a dent stays")
         train = partial(fit, training_data)
     else:  # a file or a pipe
         _refuse_options(context, "measured presses", "probe", "position_std_mm", "force_std")

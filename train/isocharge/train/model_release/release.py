@@ -145,7 +145,7 @@ def _forces_text(metadata: ModelMetadata) -> str:
     text = f"{min_force:g} to {max_force:g} N"
     if metadata.yield_force_N is not None:
         text += (
-            f"; beyond {metadata.yield_force_N:g} N the film is stressed to more than {DEFAULT_STRESS_LIMIT:g} MPa: "
+            f"; beyond {metadata.yield_force_N:g} N at the centre, the stress exceeds {DEFAULT_STRESS_LIMIT:g} MPa: "
             "PVDF yields (flag `stress`)"
         )
     return text

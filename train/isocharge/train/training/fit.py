@@ -67,8 +67,8 @@ class Fitted:
         cross_validated: Answers to the charges of `test` by networks that were not trained on these presses; None if
             `network` itself was not trained on these presses.
         outside: Presses outside the working area; None if they were not simulated.
-        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
-            or above the range of forces.
+        yield_force_N: Force at which the film yields at the centre under the sharpest of the probes, N. None if the
+            force is unknown or above the range of forces.
     """
 
     network: FoldedNetwork

@@ -46,8 +46,8 @@ class TrainingData:
         presses: Presses for training. Noise is added to the charges during the training.
         sha256: Checksum of the presses.
         outside: Presses between the domain and the clamp; None if there are none.
-        yield_force_N: Force at which the film yields under the sharpest of the probes, N. None if the force is unknown
-            or above the range of forces.
+        yield_force_N: Force at which the film yields at the centre under the sharpest of the probes, N. None if the
+            force is unknown or above the range of forces.
         field: Charges as a function of the contact; None to fit this function to `presses`.
     """
 
