@@ -186,7 +186,6 @@ def test_charge_series_of_the_whole_domain_and_a_caution_are_released_if_the_dom
 
 FAULTS = {
     "noisy": lambda charge, rng: REFERENCE.add(charge, rng),
-    "dead electrode": lambda charge, _: np.maximum(charge * [1.0, 0.0, 1.0], 1.0),
     "anything": lambda charge, rng: 10.0 ** rng.uniform(0.0, 4.0, charge.shape),
 }
 """Functions that give charges a fault, by the name of the fault."""
