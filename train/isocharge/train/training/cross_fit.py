@@ -23,7 +23,7 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
-from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses, PLACE_STEP_mm
 from isocharge.serve.presses.table_file import csv_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes, median_magnitude
 from isocharge.train.data.contact_errors import rms, rounded
@@ -33,7 +33,6 @@ from isocharge.train.data.presses import (
     MIN_PRESSES,
     N_FOLDS,
     LabelledPresses,
-    PLACE_STEP_mm,
     check_known_columns,
     complete,
     merged_places,
