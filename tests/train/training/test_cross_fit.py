@@ -294,6 +294,12 @@ def test_presses_of_one_force_or_without_forces_train_x_and_y(force_N, stated_N,
     assert predictor.flags(answer) == ()
 
 
+def test_presses_with_three_forces_give_a_model_with_a_caution(caplog):
+    presses = with_column("contact", 2, lambda _: np.resize([0.5, 1.0, 2.0], 1_200))
+    assert "only 3 different forces" in str(fit_presses(presses, "pad", QUICKER).made_with["cautions"])
+    assert "measure forces all over the range" in caplog.text
+
+
 def test_unknown_forces_that_vary_are_not_taken_for_noise():
     rng = np.random.default_rng(0)
     position = np.repeat(rng.uniform(-8.0, 8.0, (60, 2)), 10, axis=0)
