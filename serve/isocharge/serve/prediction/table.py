@@ -88,7 +88,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     # Only a few rows are predicted at a time, because the model and Python numbers need a hundred times as much memory
     # as the array.
     for start in range(0, len(charge_pC), MAX_BATCH):
-        block = charge_pC[start : start + MAX_BATCH]
+        block = np.asarray(charge_pC[start : start + MAX_BATCH])
         contacts = predictor.predict_batch(block)
         flags_of_rows = predictor.validity.batch_flags(contacts)
         is_touch_of_rows = predictor.validity.is_touch(block).tolist()
