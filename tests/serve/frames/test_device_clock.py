@@ -1,5 +1,7 @@
 """Clock of a device, compared with simulated devices of known rate and jitter."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -91,18 +93,15 @@ def test_late_reading_does_not_change_the_number_of_wraps():
     assert not any(time.is_clock_reset for time in times)
 
 
-def test_clock_of_16_bits_in_us_may_wrap_at_each_reading():
-    """The clock wraps after 65.536 ms. The readings have intervals of 50 ms."""
+@pytest.mark.parametrize(("start_us", "modulus"), [(0, 2**16), (-500_000, MODULUS)])
+def test_clock_of_16_bits_in_us_may_wrap_at_each_reading_and_a_clock_with_a_sign_may_begin_below_zero(
+    start_us, modulus
+):
+    """The first clock wraps after 65.536 ms. The readings have intervals of 50 ms."""
     clock = DeviceClock()
-    for t_us in range(0, 1_000_000, 50_000):
-        (time,) = read(clock, chunk_at(1e-6 * t_us), [t_us % 2**16], 2**16)
-        assert time.device_us == t_us
-
-
-def test_clock_with_a_sign_may_begin_below_zero():
-    clock = DeviceClock()
-    frames = [read(clock, chunk_at(1e-6 * t_us), [t_us])[0] for t_us in range(-50_000, 50_000, 5000)]
-    assert [frame.dt_s for frame in frames[1:]] == [0.005] * 19
+    for t_us in range(start_us, start_us + 1_000_000, 50_000):
+        (time,) = read(clock, chunk_at(1e-6 * t_us), [int(math.fmod(t_us, modulus))], modulus)
+        assert (time.device_us, time.dt_s) == (t_us, (t_us > start_us) * 50_000 * 1e-6)
 
 
 def test_times_never_decrease():

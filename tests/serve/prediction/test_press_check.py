@@ -49,9 +49,12 @@ def checked(predictor, measure):
 
 
 def test_errors_of_single_presses_equal_their_displacements(film, predictor):
-    """The electrodes of the presses are in another order than those of the model."""
-    contact = np.array([[1.0, 2.0, 0.5], [-3.0, 0.5, 1.0], [np.nan, np.nan, 1.0], [0.0, 1.0, np.nan]])
-    pressed = np.array([[1.3, 1.6, 0.55], [-3.0, 0.5, 0.98], [0.0, 0.0, 1.02], [0.0, 1.5, 1.0]])
+    """The electrodes of the presses are in another order than those of the model.
+
+    The first and the last press are at one place, and share the error of its position.
+    """
+    contact = np.array([[1.0, 2.0, 0.5], [-3.0, 0.5, 1.0], [np.nan, np.nan, 1.0], [1.0, 2.0, np.nan]])
+    pressed = np.array([[1.3, 1.6, 0.55], [-3.0, 0.5, 0.98], [0.0, 0.0, 1.02], [1.0, 2.5, 1.0]])
     stds = np.full(4, 0.1), np.full(4, 0.01)
     charge_pC = film.charge_pC(*pressed.T)[:, ::-1]
     presses = MeasuredPresses(contact, charge_pC, *stds, film.electrodes[::-1], (2, 3, 4, 5))
@@ -64,6 +67,7 @@ def test_errors_of_single_presses_equal_their_displacements(film, predictor):
     np.testing.assert_allclose(errors.noise_std[:, 0], np.where([1, 1, 0, 1], std, nan), rtol=1e-5)
     np.testing.assert_allclose(errors.noise_std[:, 2], [7e-4 / 0.5, 7e-4, 7e-4, nan], rtol=1e-5)
     np.testing.assert_array_equal(errors.rig_std[:, 2], [0.01, 0.01, 0.01, nan])
+    np.testing.assert_allclose(errors.variance[:, 1] - errors.noise_std[:, 1] ** 2, [0.02, 0.01, nan, 0.02])
 
 
 def test_model_that_fits_has_no_unexplained_error(checked):
@@ -218,7 +222,7 @@ def test_constant_error_of_the_rig_reduces_the_significance_of_a_common_error():
         assert common.significance[0] == pytest.approx(0.1 / math.hypot(common.std[0], constant_mm))
 
 
-@pytest.mark.parametrize(("degrees", "tolerance"), [(1, 0.05), (2, 0.013), (100, 2e-4), (3_000_000, 1e-6)])
+@pytest.mark.parametrize(("degrees", "tolerance"), [(1, 0.05), (2, 0.013), (3_000_000, 1e-6)])
 def test_chi_squared_survival_is_near_scipy(degrees, tolerance):
     for sigmas in np.linspace(-4.0, 20.0, 49):
         statistic = max(0.0, degrees + sigmas * math.sqrt(2.0 * degrees))

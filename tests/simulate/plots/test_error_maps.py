@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from matplotlib.colors import LogNorm
 
 from isocharge.simulate import load_sensor
 from isocharge.simulate.identifiability.mirror_region import MirrorRegion
@@ -28,7 +27,7 @@ def test_error_maps_picture_marks_the_position_of_the_largest_error(nuisances, b
         assert [line.get_xydata().tolist() for line in axes.lines] == [[[2.0, 4.0]]]
         assert "worst 3 mm (cross), rms 1.35 mm" in axes.get_title()
         (shades,) = axes.collections
-        assert (type(shades.norm), *shades.get_clim()) == (LogNorm, 0.1, 1.0)
+        assert shades.get_clim() == (0.1, 1.0)
 
 
 def test_mirror_picture_divides_the_rings_into_sectors():

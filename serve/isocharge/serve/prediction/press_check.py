@@ -208,7 +208,7 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
 
     # The guarantee holds for all presses, so that the factor is computed from the bad presses, too.
     std_factor = None  # remains None if too few presses are compared for a guarantee
-    if np.count_nonzero(is_compared) >= FEWEST_HELD_OUT:
+    if is_compared.sum() >= FEWEST_HELD_OUT:
         std_factor = StdFactor.from_errors(errors.error[is_compared], errors.noise_std[is_compared])
 
     # Collect the explanations for the user.

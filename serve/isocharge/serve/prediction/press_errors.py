@@ -69,8 +69,13 @@ class PressErrors:
 
     @property
     def variance(self) -> Array:
-        """Expected variances of the errors, shape (n, 3)."""
-        return self.noise_std**2 + self.rig_std**2
+        """Variances of independent errors whose means scatter like those of the real errors, shape (n, 3).
+
+        The errors of presses at one place are not independent, so the variances of their positions are multiplied.
+        """
+        rig_variance = self.rig_std**2
+        rig_variance.T[:FORCE] *= self.presses.same_place_count  # rows: x and y of all presses
+        return self.noise_std**2 + rig_variance
 
     @property
     def chi_squared(self) -> Array:

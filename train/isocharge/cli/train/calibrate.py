@@ -132,7 +132,7 @@ def calibrate_command(
         if earlier is not None:
             problem = replace(problem, earlier=read_earlier(earlier, problem, presses, held_out_presses))
         if presses is not None and held_out_presses is not None:
-            held_out_presses = usable_held_out(held_out_presses, presses, problem)
+            held_out_presses = usable_held_out(held_out_presses, presses, problem, problem.domain)
 
         # Calibrate the film. Without presses, the next presses are chosen for the mean film.
         if presses is None:

@@ -22,7 +22,7 @@ def report_command(
         typer.Argument(
             metavar="DATASET|PRESSES.csv...",
             help="Dataset folders of `isocharge simulate sweep` or of measured presses. With --sensor also CSV files "
-            "of 50 or more measured presses.",
+            "of measured presses at 50 or more positions.",
         ),
     ],
     output: NewFolderOption,

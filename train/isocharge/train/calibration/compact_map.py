@@ -109,8 +109,6 @@ def compact_charges(
     return replace(
         series,
         directions=_directions(series, film, calibrated, remaining_films, few_contacts, few_charges, executor),
-        # The description of a film is at best as accurate as the measurement of its charges.
-        charge_std=max(series.charge_std, film.noise.gain),
         offset_pC=film.values[film.layout.offset],
         pretension_MPa=film.value(PRETENSION.name),
         tension_std_MPa=PRETENSION.drift,

@@ -223,10 +223,10 @@ def _candidates(problem: CalibrationProblem) -> Array:
     """
     domain = problem.domain
     even_position = domain.radius * sunflower(N_CONTACTS)  # shape (N_CONTACTS, 2), mm
-    rounded_position = GRID_MM * np.round(even_position / GRID_MM)
-    rounded_position += 0.0  # replaces -0.0 by 0.0, which is easier to read
+    # The addition replaces -0.0 by 0.0, which is easier to read.
+    rounded_position = GRID_MM * np.round(even_position / GRID_MM) + 0.0
     rounded_position = np.unique(rounded_position, axis=0)
-    distance = np.hypot(rounded_position[:, 0], rounded_position[:, 1])  # from the centre
+    distance = np.linalg.norm(rounded_position, axis=1)  # from the centre
     position = rounded_position[distance <= domain.radius]
 
     low, high = domain.force_range

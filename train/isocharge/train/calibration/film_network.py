@@ -51,8 +51,7 @@ def training_data(
     # estimated for the middle of the session. After the session, the gain therefore differs from the estimate by half
     # of the drift, and may change further or return. One gain error is drawn for each press.
     drift_rms = np.hypot(film.value("drift"), film.std("drift"))
-    gain_error_std = 0.5 * drift_rms
-    gain_error = gain_error_std * rng.standard_normal((N_PRESSES, 1))
+    gain_error = 0.5 * drift_rms * rng.standard_normal((N_PRESSES, 1))
     charge *= 1.0 + gain_error
 
     sensor, probe = charges.prior.film(film.film_values)

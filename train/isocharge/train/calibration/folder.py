@@ -40,7 +40,7 @@ from isocharge.serve.model.model_folder import check_target, version_folders
 from isocharge.serve.presses.measured_presses import MeasuredPresses, read_presses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor
 from isocharge.serve.presses.table_file import csv_text
-from isocharge.simulate import NoiseModel
+from isocharge.simulate import Domain, NoiseModel
 from isocharge.simulate.sensor.sensor_file import sensor_to_dict, sensor_to_toml
 from isocharge.simulate.solver.assembly import single_threaded_blas
 from isocharge.train.calibration.compact_map import compact_charges
@@ -286,7 +286,7 @@ def write_calibration(
     film = result.film
     check_calibration_folder(folder, problem.electrodes)
     if held_out is not None:
-        held_out = usable_held_out(held_out, result.presses, problem)
+        held_out = usable_held_out(held_out, result.presses, problem, problem.domain)
 
     # Train the network.
     with single_threaded_blas():
@@ -295,13 +295,18 @@ def write_calibration(
     settings = FitConfig(requested.network, replace_setting(requested.training, noise=film.noise))
     fitted = fit(training_data(result.charges, film, series, executor), settings)
     if held_out is not None:
-        fitted = with_guarantee(fitted, held_out)
+        fitted = with_guarantee(fitted, usable_held_out(held_out, result.presses, problem, fitted.domain))
 
     # Write the version folder, and copy the readable files.
     sensor, _ = result.sensor_and_probe
-    is_folded = CHARGES in fitted.files  # a training writes this file only if the charges fold
+    follower_map = replace(
+        series,
+        is_folded=CHARGES in fitted.files,  # a training writes this file only if the charges fold
+        # For a follower, the description of a film is at best as accurate as the measurement of its charges.
+        charge_std=max(series.charge_std, film.noise.gain),
+    )
     files = {
-        CHARGES: charge_map_bytes(replace(series, is_folded=is_folded)),
+        CHARGES: charge_map_bytes(follower_map),
         RESULT: json_text(result_table(result)).encode(),
         SENSOR: sensor_to_toml(sensor).encode(),
         PICTURE: picture_bytes(calibration_picture(result)),
@@ -320,23 +325,24 @@ def write_calibration(
 
 
 def usable_held_out(
-    held_out: MeasuredPresses, presses: MeasuredPresses, problem: CalibrationProblem
+    held_out: MeasuredPresses, presses: MeasuredPresses, problem: CalibrationProblem, domain: Domain
 ) -> MeasuredPresses:
     """Select the held-out presses that show how large the errors of the model are.
 
-    A held-out press is selected if it lies in the working area, has all charges, and has a known position or force. A
-    press with the same charges as an earlier held-out press is left out.
+    A held-out press is selected if it lies in the domain, has all charges, and has a known position or force. A press
+    with the same charges as an earlier held-out press is left out.
 
     Args:
         held_out: Presses that were not used for the calibration.
         presses: Presses of the calibration.
         problem: The calibration problem.
+        domain: Domain of the model. Before the training, this is the domain of the problem. The training reduces it if
+            the map from contacts to charges folds.
 
     Raises:
         PressError: If a held-out press was also used for the calibration, or if fewer than `FEWEST_HELD_OUT` presses
             remain, so that the factor for the standard deviations of the model cannot be computed.
     """
-    domain = problem.domain
     sensor_name = problem.sensor.name
     held_out = held_out.of_electrodes(problem.electrodes, sensor_name)
     learned = presses.of_electrodes(problem.electrodes, sensor_name)

@@ -12,7 +12,6 @@ from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.simulate import Domain, NoiseModel
 from isocharge.train.calibration.film_charges import FilmCharges
 from isocharge.train.calibration.film_estimate import SESSION, Layout, discrepancy_jacobian
-from isocharge.train.data.presses import PLACE_STEP_mm
 
 UNKNOWN_STD = np.inf
 """Standard deviation of a value that was not measured."""
@@ -59,9 +58,8 @@ class PressData:
     def of(cls, presses: MeasuredPresses, noise: NoiseModel, domain: Domain) -> "PressData":
         """Convert measured presses whose electrodes are in the order of the sensor.
 
-        Presses at one place share the error of their position, so this error is hardly smaller for the mean of the
-        presses. If n presses are at one place, the standard deviations of their positions are therefore multiplied by
-        the square root of n.
+        The standard deviations of the positions contain the factor for presses at one place
+        (`MeasuredPresses.same_place_count`).
 
         Args:
             presses: The presses; NaN stands for unknown values.
@@ -73,10 +71,7 @@ class PressData:
         charge = np.where(is_charge_known, presses.charge_pC, 0.0)
         log_contact = with_log_force(presses.contact)
         is_contact_known = np.isfinite(log_contact)
-        position = presses.contact[:, :2]
-        distance_mm = np.linalg.norm(position[:, None] - position, axis=2)
-        same_place_count = (distance_mm <= PLACE_STEP_mm).sum(axis=1)  # of each press, with the press itself
-        position_std = presses.position_std_mm * np.sqrt(same_place_count)
+        position_std = presses.position_std_mm * np.sqrt(presses.same_place_count)
         measured_std = np.column_stack([position_std, position_std, presses.force_std])
         return cls(
             charge=charge,

@@ -152,15 +152,13 @@ class PressSession:
 
         The proposal is computed at the first access after each change, and is then stored.
         """
-        if self._proposed is not None:
-            return self._proposed
-
-        # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses so
-        # far count as the first presses of this plan, and the press after them is proposed.
-        film = None if self.result is None else self.result.film
-        planned_count = len(self) + 1 if film is None else 1
-        plan = next_presses(self.problem, self._charges, planned_count, film, **self._stds)
-        self._proposed = plan[-1]
+        if self._proposed is None:
+            # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses
+            # so far count as the first presses of this plan, and the press after them is proposed.
+            film = None if self.result is None else self.result.film
+            planned_count = len(self) + 1 if film is None else 1
+            plan = next_presses(self.problem, self._charges, planned_count, film, **self._stds)
+            self._proposed = plan[-1]
         return self._proposed
 
     @property
@@ -200,8 +198,7 @@ class PressSession:
             contact: Contact (x, y, F) of the press, shape (3,), mm and N, NaN where unknown.
         """
         x, y, _ = contact.tolist()
-        has_one_coordinate = math.isnan(x) != math.isnan(y)
-        if has_one_coordinate:
+        if math.isnan(x) != math.isnan(y):
             raise PressError("expected both x and y, or ? for both, got one of them")
         domain = self.problem.solved_domain
         if domain.is_outside(contact[None]).any():
@@ -244,13 +241,11 @@ class PressSession:
             return
         try:
             # Unevenness is a first-order change here, because the next press must be proposed at once.
-            self.result = calibrate(
-                self.presses, self.problem, executor=self._executor, start=self._charges, accurate=False
-            )
+            self.result = calibrate(presses, self.problem, executor=self._executor, start=self._charges, accurate=False)
         except PressError as error:
             self.refusal = str(error)
-            return
-        self._charges = self.result.charges
+        else:
+            self._charges = self.result.charges
 
     @property
     def summary(self) -> tuple[str, ...]:

@@ -291,7 +291,7 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
 
     # Compute the mean of each coordinate and of each value over the presses of each contact.
     table = np.column_stack([unit_contact, values])
-    sums = np.stack([np.bincount(contact_of_press, column) for column in table.T], axis=1)
+    sums = np.column_stack([np.bincount(contact_of_press, column) for column in table.T])
     contact, mean_value = np.split(sums / press_count[:, None], [3], axis=1)
     return contact, mean_value, press_count, contact_of_press
 

@@ -28,7 +28,7 @@ def position_error(contact: Array, truth: Array) -> Array:
     Returns:
         Distances, shape (n,), mm.
     """
-    return np.hypot(contact[:, 0] - truth[:, 0], contact[:, 1] - truth[:, 1])
+    return np.asarray(np.linalg.norm(contact[:, :2] - truth[:, :2], axis=1))
 
 
 def force_error_percent(contact: Array, truth: Array) -> Array:

@@ -17,7 +17,7 @@ from isocharge.common.arrays import Array, Booleans
 from isocharge.common.errors import DatasetError, PressError, cut, shown
 from isocharge.common.files import sha256_of
 from isocharge.common.structs import Positive, convert
-from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses
+from isocharge.serve.presses.measured_presses import CONTACT, MeasuredPresses, PLACE_STEP_mm
 from isocharge.simulate import Dataset, Domain, Probe, Samples, Sensor
 from isocharge.simulate.numerics.disk import log_spaced_forces
 from isocharge.train.data.channel_noise import Noise
@@ -39,9 +39,6 @@ YIELD_FORCE = "yield_force_N"
 MIN_PRESSES = 500
 """Smallest number of presses for a fit."""
 
-PLACE_STEP_mm = 0.02
-"""Largest distance between neighbouring positions that count as one place, mm. The noise of encoders is smaller."""
-
 MIN_PLACES = 50
 """Smallest number of places for a fit, and smallest number of measured presses for training or for measuring errors."""
 
@@ -61,7 +58,7 @@ class LabelledPresses:
     @classmethod
     def of(cls, samples: Samples) -> "LabelledPresses":
         """Return the contacts and charges of samples without checking them."""
-        return cls(np.stack([samples.x_mm, samples.y_mm, samples.force_N], axis=1), samples.charge_pC)
+        return cls(np.column_stack([samples.x_mm, samples.y_mm, samples.force_N]), samples.charge_pC)
 
     def __getitem__(self, rows: np.ndarray | slice) -> "LabelledPresses":
         """Return some of the presses."""
@@ -309,9 +306,7 @@ def have_charges_of_earlier(charge: Array) -> Booleans:
         charge: Charges of the presses, shape (n, n_electrode), pC. A press with an unknown charge is not a copy.
     """
     _, first_rows = np.unique(charge, axis=0, return_index=True)
-    is_copy = np.ones(len(charge), dtype=bool)
-    is_copy[first_rows] = False
-    return is_copy
+    return ~np.isin(np.arange(len(charge)), first_rows)
 
 
 def complete(presses: MeasuredPresses) -> Booleans:
@@ -356,5 +351,5 @@ def check_enough(count: int, total_count: int, sensor: str) -> None:
 
 def presses_sha256(presses: MeasuredPresses) -> str:
     """Return the checksum of the contacts, the charges and the standard deviations of measured presses."""
-    table = np.column_stack([presses.contact, presses.charge_pC, presses.position_std_mm, presses.force_std])
+    table = np.column_stack([*presses.columns.values()])
     return sha256_of(table.tobytes())

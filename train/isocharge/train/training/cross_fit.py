@@ -23,7 +23,7 @@ from torch import Tensor
 
 from isocharge.common.arrays import Array, Integers
 from isocharge.common.errors import PressError, cut
-from isocharge.serve.presses.measured_presses import MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses, PLACE_STEP_mm
 from isocharge.serve.presses.table_file import csv_text
 from isocharge.train.data.channel_noise import ChannelNoise, LocalPlanes, median_magnitude
 from isocharge.train.data.contact_errors import rms, rounded
@@ -33,7 +33,6 @@ from isocharge.train.data.presses import (
     MIN_PRESSES,
     N_FOLDS,
     LabelledPresses,
-    PLACE_STEP_mm,
     check_known_columns,
     complete,
     merged_places,
@@ -89,7 +88,8 @@ def fit_presses(
 
     Several networks are trained for a cross-validation. One further network learns the mean outputs of these networks
     (distillation), and then learns misfits. A warning is logged if presses are left out. Another warning is logged if
-    all presses have nearly the same force, or if no press has a known force. The network then only learns x and y.
+    all presses have nearly the same force, or if no press has a known force. The network then only learns x and y. A
+    warning is also logged if the presses have only a few different forces.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out. Presses with
@@ -121,6 +121,24 @@ def fit_presses(
     force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
+    # Count the different forces. Measurements of one force lie within three standard deviations of the force.
+    relative_step = 6.0 * np.median(usable.force_std)
+    force_count = len(set(np.round(np.log(usable.contact[:, 2]) / relative_step)))
+    made_with: dict[str, object] = {"config": settings.to_dict()}  # for the metadata of the model
+    if force_std is not None:
+        made_with["constant_force"] = {
+            "force_N": rounded(np.exp(domain.centre[2])),
+            "force_std": rounded(force_std),
+            "is_known": bool(presses.placed.any()),
+        }
+    elif force_count < 8:
+        # The networks learn that only these forces occur, and the cross-validation contains no other forces.
+        caution = (
+            f"the presses have only {force_count} different forces, and the model may answer other forces with one of "
+            "them: measure forces all over the range"
+        )
+        _log.warning("%s", caution)
+        made_with["cautions"] = [caution]
     unit_contact = domain.to_unit(labelled.contact)
     if force_std is not None and force_std >= 1.0:  # the forces are unknown and may vary
         unit_contact[:, 2] = _unit_log_sizes(labelled.charge)
@@ -151,22 +169,12 @@ def fit_presses(
     misfit = np.maximum(misfit, network_misfit)
     cross_validated = Answers(contact, std * [position_factor, position_factor, force_factor], misfit)
 
-    # Describe the training in the metadata of the model.
-    made_with: dict[str, object] = {
-        "config": settings.to_dict(),
-        "measured": {
-            "presses": len(labelled),
-            "places": place_count(merged_uncertain_places(usable)),
-            "folds": N_FOLDS,
-            "std_factors": [rounded(position_factor), rounded(force_factor)],
-        },
+    made_with["measured"] = {
+        "presses": len(labelled),
+        "places": place_count(merged_uncertain_places(usable)),
+        "folds": N_FOLDS,
+        "std_factors": [rounded(position_factor), rounded(force_factor)],
     }
-    if force_std is not None:
-        made_with["constant_force"] = {
-            "force_N": rounded(np.exp(domain.centre[2])),
-            "force_std": rounded(force_std),
-            "is_known": bool(presses.placed.any()),
-        }
     return Fitted(
         network=folded_network.with_scaled_std(position_factor, force_factor),
         sensor={"name": name, "electrodes": list(usable.electrodes)},

@@ -131,14 +131,15 @@ def invertible_domain(
     """
     requested_radius = field.domain.radius
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
-    fold_radius = float(f"{area.unambiguous_radius:.6g}")  # rounded to the digits that the sentences state
-    if not np.isfinite(area.fold_radius) or fold_radius >= requested_radius:  # no fold in the domain
+    fold_radius = area.unambiguous_radius  # rounded down
+    if not np.isfinite(area.fold_radius):  # no fold in the domain
         return field.domain, ()
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
         probable_fold = (
             f"the map from contacts to charges probably folds beyond about {fold_radius:.2g} mm: two contacts give the "
             f"same charges there, and the model, which is trained for {requested_radius:g} mm, confuses them; a fit "
-            f"with an error of {100.0 * field.charge_std:.2g} % does not show where: take more presses, of one probe"
+            f"with an error of {100.0 * field.charge_std:.2g} % does not show where: choose a smaller radius, or add "
+            "an electrode; in a dataset, more presses of one probe may show it"
         )
         cautions = (probable_fold,) if fold_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
         return field.domain, cautions
@@ -146,7 +147,8 @@ def invertible_domain(
     if fold_radius < MIN_RADIUS_RATIO * requested_radius:
         raise DatasetError(
             f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested_radius:g} mm "
-            "asked for: beyond, two contacts give the same charges; add an electrode, or take a biaxial film"
+            "asked for: beyond, two contacts give the same charges; choose a smaller radius, add an electrode, or take "
+            "a biaxial film"
         )
     certain_fold = (
         f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
