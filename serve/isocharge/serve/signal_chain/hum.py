@@ -68,6 +68,11 @@ class Hum(Stage):
         self._elapsed_s = 0.0
         self.reset()
 
+    def reset(self) -> None:
+        """Learn the hum again, because the clock may have been reset. Compare the next frame with no earlier one."""
+        self._reference_pC: Array | None = None
+        self._learned_s = 0.0  # time over which the hum has been learned
+
     def step(self, frame: Frame) -> None:
         """Subtract the hum from a frame, and update the estimate of the hum.
 
@@ -106,11 +111,6 @@ class Hum(Stage):
             self._reference_pC = raw_pC
             self._elapsed_s = 0.0
         frame.charge_pC = raw_pC - (self._phasor_pC * unit_phasor).real
-
-    def reset(self) -> None:
-        """Learn the hum again, because the clock may have been reset. Compare the next frame with no earlier one."""
-        self._reference_pC: Array | None = None
-        self._learned_s = 0.0  # time over which the hum has been learned
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
