@@ -197,7 +197,7 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
     if estimation.is_bad.any():
         # Assume the errors of the last hypothesis, which are the largest, but only the middle size of the errors of the
         # positions. With the largest size, a press at a wrong place would not be recognised.
-        _, (middle_ratio, _), _ = POSITION_RATIOS
+        middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
         next_assumed = all_hypotheses[-1].errors._replace(position_ratio=middle_ratio)
     for _ in range(MAX_SEARCHES):
         if next_assumed == assumed:
