@@ -72,6 +72,9 @@ these copies."""
 PRESSES_FILE = "presses.csv"
 """Name of the file in the version folder with the presses on which the model was trained."""
 
+MAX_FORCE_GAP = 1.0 / 6.0
+"""Largest distance between the logarithms of neighbouring forces, relative to the whole range, without a caution."""
+
 UNKNOWN_FORCE_N = 1.0
 """Force that a model states if it was trained on presses without forces, N. The standard deviation of this force has
 the same size."""
@@ -89,7 +92,7 @@ def fit_presses(
     Several networks are trained for a cross-validation. One further network learns the mean outputs of these networks
     (distillation), and then learns misfits. A warning is logged if presses are left out. Another warning is logged if
     all presses have nearly the same force, or if no press has a known force. The network then only learns x and y. A
-    warning is also logged if the presses have only a few different forces.
+    warning is also logged if there is a wide gap between the forces, as between dead weights.
 
     Args:
         presses: At least 500 presses at 50 places. Presses with an unknown place or charge are left out. Presses with
@@ -121,9 +124,9 @@ def fit_presses(
     force_std = constant_force_std(usable)  # None if the forces vary
     labelled = LabelledPresses(usable.contact, usable.charge_pC)
     domain = PressedArea.of_contacts(labelled.contact)
-    # Count the different forces. Measurements of one force lie within three standard deviations of the force.
-    relative_step = 6.0 * np.median(usable.force_std)
-    force_count = len(set(np.round(np.log(usable.contact[:, 2]) / relative_step)))
+    log_force = np.sort(np.log(usable.contact[:, 2]))
+    gap = np.diff(log_force)
+    widest = gap.argmax()
     made_with: dict[str, object] = {"config": settings.to_dict()}  # for the metadata of the model
     if force_std is not None:
         made_with["constant_force"] = {
@@ -131,11 +134,12 @@ def fit_presses(
             "force_std": rounded(force_std),
             "is_known": bool(presses.placed.any()),
         }
-    elif force_count < 8:
-        # The networks learn that only these forces occur, and the cross-validation contains no other forces.
+    elif gap[widest] > MAX_FORCE_GAP * gap.sum():
+        # The networks learn that forces in the gap do not occur, and the cross-validation contains no such forces.
+        lower_N, upper_N = np.exp(log_force[[widest, widest + 1]])
         caution = (
-            f"the presses have only {force_count} different forces, and the model may answer other forces with one of "
-            "them: measure forces all over the range"
+            f"no press has a force between {lower_N:.3g} and {upper_N:.3g} N, and the model may be wrong there: "
+            "measure forces all over the range"
         )
         _log.warning("%s", caution)
         made_with["cautions"] = [caution]
