@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 from msgspec import defstruct, structs
 
+from isocharge.common.arrays import Array
 from isocharge.common.errors import DeviceError
 from isocharge.common.files import StrPath
 from isocharge.common.structs import convert, read_toml
@@ -88,6 +89,7 @@ class Prediction(Stage):
         self._setup = setup
         self._predictor = predictor_for(setup.device, setup.model)
         setup.predictor = self._predictor
+        self._noise_pC: Array | None = None  # noise for which the predictor was chosen
 
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges.
@@ -97,8 +99,10 @@ class Prediction(Stage):
         """
         if frame.charge_pC is None or not frame.is_contact:
             return
-        predictor = self._predictor.for_noise_at_rest(frame.noise_pC)
-        self._setup.predictor = predictor
+        if frame.noise_pC is not self._noise_pC:  # the film was tared, or the board sends currents
+            self._noise_pC = frame.noise_pC
+            self._setup.predictor = self._predictor.for_noise_at_rest(frame.noise_pC)
+        predictor = self._setup.model
         frame.contact, frame.contact_flags = predictor.predict_with_flags(frame.charge_pC)
         if frame.warming_error_pC is not None:
             # The contact changes by half of the difference between the contacts of raised and of lowered charges.
