@@ -345,5 +345,5 @@ def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callab
         setattr(sys.modules[package], name, value)
         return value
 
-    list_public_names = public_names.copy  # as `__dir__`, so that tab completion suggests only the public names
-    return import_public_name, list_public_names, public_names
+    # The second function becomes `__dir__`, so that tab completion suggests only the public names.
+    return import_public_name, public_names.copy, public_names

@@ -17,7 +17,7 @@ LARGEST_ERRORS = {
 @pytest.fixture(scope="module")
 def fitted(split):
     """Every method, fitted to the presses for training and their charge map, by its name."""
-    task = FittingTask(split.train, split.field, noise_model("reference"))
+    task = FittingTask(split.field, noise_model("reference"))
     methods = [build_method(task) for build_method in METHOD_BUILDERS]
     return {method.name: method for method in methods}
 

@@ -85,15 +85,14 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor) -> Array:
     touch = TouchStream(predictor)
     followed = []
     with virtual_sensor(forward_map) as sensor, Port(sensor.url) as port:
-        rate_Hz = sensor.script.rate_Hz
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, FOLLOWED_FRAMES)
-        script = sensor.script.contact
+        script = sensor.script
         for record in track(records, "following", FOLLOWED_FRAMES):
             # The script that the virtual sensor repeats contains the true press of this frame.
-            row = round(1e-6 * (record.t_device_us or 0) * rate_Hz) % len(script)
-            if record.contact and sensor.script.touching[row]:
-                followed.append((script[row], (record.x_mm, record.y_mm, record.force_N)))
+            row = round(1e-6 * (record.t_device_us or 0) * script.rate_Hz) % len(script.contact)
+            if record.contact and script.touching[row]:
+                followed.append((script.contact[row], (record.x_mm, record.y_mm, record.force_N)))
     say(f"   {summary(touch)}")
     return np.array(followed, float)
 

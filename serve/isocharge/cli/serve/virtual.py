@@ -91,8 +91,8 @@ def virtual_command(
     if scripted_presses is not None:  # the map must contain all presses of the script
         x_mm, y_mm, force_N = scripted_presses.contact.T
         distance_mm = np.hypot(x_mm, y_mm)
-        radius = float(np.fmax.reduce(ROUNDING_MARGIN * distance_mm, initial=radius))  # ignores NaN between presses
-        force_max = float(np.max(ROUNDING_MARGIN * force_N, initial=force_max))
+        radius = np.fmax.reduce(ROUNDING_MARGIN * distance_mm, initial=radius)  # ignores NaN between presses
+        force_max = np.max(ROUNDING_MARGIN * force_N, initial=force_max)
     with shown_progress(), solving_executor(played_sensor.film) as executor:
         forward_map = ForwardMap.build(
             played_sensor,

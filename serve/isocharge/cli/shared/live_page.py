@@ -111,10 +111,10 @@ def live_page(
     metadata: ModelMetadata,
     *,
     is_recording: bool = False,
-    token: str | None = None,
-    tls_cert: Path | None = None,
-    tls_key: Path | None = None,
-    allow_host: Iterable[str] | None = None,
+    token: str | None,
+    tls_cert: Path | None,
+    tls_key: Path | None,
+    allow_host: Iterable[str] | None,
 ) -> Iterator["LivePage | None"]:
     """Context manager that serves the page of a stream in a separate thread, and prints the address of the page.
 

@@ -299,8 +299,7 @@ def shown_progress() -> Iterator[None]:
     from rich.progress import Progress, TaskID
 
     console = Console(stderr=True, markup=False, emoji=False)
-    columns = Progress.get_default_columns()
-    with Progress(*columns, "{task.fields[note]}", console=console, transient=True) as bars:
+    with Progress(*Progress.get_default_columns(), "{task.fields[note]}", console=console, transient=True) as bars:
 
         @cache
         def bar_of(title: str) -> TaskID:

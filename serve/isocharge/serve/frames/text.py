@@ -153,39 +153,27 @@ class TextParser(DelimitedParser):
 
         Args:
             piece: Bytes of the line, without the line feed.
+
+        Raises:
+            ValueError: If the line cannot be parsed. The caller counts the line as rejected.
         """
         size = len(piece) + 1  # with the line feed
         is_first_line = self._is_first_line
         self._is_first_line = False
-        try:
-            line = _decoded(piece.strip(CONTROL_CHARACTERS)).strip()
-            text = clean_text(line)
-            if not text:
-                self._store_comment(line)
-                return []
-            # The beginning of the first line may be missing, so that "1.2" may be the end of "801.2". The first line is
-            # therefore rejected if a number begins at its first character.
-            if is_first_line and 0 in parse_line(text).starts:
-                return self._reject(size)
-            return self._read_line(text, size)
-        except ValueError:
+        line = _decoded(piece.strip(CONTROL_CHARACTERS)).strip()
+        text = clean_text(line)
+        if not text:  # the line is blank or a comment
+            self.unread_line = line or self.unread_line
+            # A comment without numbers, such as `# t_ms,A,B,C`, may be the header with the names of the columns. No
+            # header is needed after a layout has been recognised.
+            if self.layout is None and line and not parse_line(line).names:
+                self._headers.append(line)
+            return []
+        # The beginning of the first line may be missing, so that "1.2" may be the end of "801.2". The first line is
+        # therefore rejected if a number begins at its first character.
+        if is_first_line and 0 in parse_line(text).starts:
             return self._reject(size)
-
-    def _store_comment(self, text: str) -> None:
-        """Store a comment such as `# t_ms,A,B,C`, which may be the header with the names of the columns.
-
-        A comment with numbers is no header, and no header is needed after a layout has been recognised. In both cases,
-        the comment is only stored as the latest text that is not a frame.
-
-        Args:
-            text: The comment, or an empty text for a blank line.
-
-        Raises:
-            ValueError: If the comment contains characters that are not printable.
-        """
-        self.unread_line = text or self.unread_line
-        if self.layout is None and text and not parse_line(text).names:
-            self._headers.append(text)
+        return self._read_line(text, size)
 
     def _reject(self, size: int) -> list[Frame]:
         """Count a rejected line, and return an empty list, because a rejected line completes no frame."""

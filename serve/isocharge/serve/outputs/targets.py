@@ -36,16 +36,13 @@ def _open_mcap(target: str, context: OutputContext) -> Output:
     return McapFile(Path(target), context.electrodes, is_ros2=is_ros2, is_live=context.is_live)
 
 
-ROS2_MCAP_FILE = OutputKind(form=f"FILE{ROS2_SUFFIX}", accepts=is_file_with(ROS2_SUFFIX), open=_open_mcap)
-MCAP_FILE = OutputKind(form="FILE.mcap", accepts=is_file_with(".mcap"), open=_open_mcap)
-
 OUTPUT_KINDS: tuple[OutputKind, ...] = (
     STDOUT_JSON,
     STDOUT_CSV,
     JSON_FILE,
     CSV_FILE,
-    ROS2_MCAP_FILE,
-    MCAP_FILE,
+    OutputKind(form=f"FILE{ROS2_SUFFIX}", accepts=is_file_with(ROS2_SUFFIX), open=_open_mcap),
+    OutputKind(form="FILE.mcap", accepts=is_file_with(".mcap"), open=_open_mcap),
     UDP,
 )
 """Kinds of outputs of this package. If several kinds accept a target, the first of these kinds is used."""

@@ -25,7 +25,7 @@ from msgspec import Meta, Struct
 from msgspec.json import encode
 
 from isocharge.common.errors import RecordingError, cut, is_printable
-from isocharge.common.files import AtomicWriter, StrPath, as_output_errors, bounded_lines
+from isocharge.common.files import MAX_LINE_CHARACTERS, AtomicWriter, StrPath, as_output_errors, bounded_lines
 from isocharge.common.structs import WrongKey, parse_json
 from isocharge.serve.model.metadata import ModelLabel
 from isocharge.serve.port.file_source import Chunk, Moment, foreign_kind
@@ -35,9 +35,6 @@ VERSION = 1
 
 KIND = "isocharge_recording"
 """Key of the version in the first line, by which a recording is recognised."""
-
-LONGEST_ENTRY = 1 << 20
-"""Length of the longest line, characters. A chunk of 64 KiB in base64 has a tenth of this length."""
 
 Latency = Annotated[float, Meta(ge=-2e16, le=2e16, description="a difference of two monotonic clocks, us")]
 
@@ -175,7 +172,7 @@ class Recording:
             if not path.is_file():  # the file is opened twice, but a pipe can be read only once
                 raise RecordingError("there is no regular file of that name")
             with path.open("rb") as file:
-                first_line = file.readline(LONGEST_ENTRY)  # empty if the file is empty
+                first_line = file.readline(MAX_LINE_CHARACTERS)  # empty if the file is empty
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
             reason = foreign_kind(str(path), first_line) or cut(str(error))
@@ -226,7 +223,7 @@ class Recording:
         line_number = 1
         try:
             with self._path.open(encoding="utf-8", errors="replace") as file:
-                for line in bounded_lines(file, LONGEST_ENTRY):
+                for line in bounded_lines(file):
                     if not line.endswith("\n"):  # only the last line of the file can be incomplete
                         return
                     is_header = line_number == 1

@@ -17,7 +17,6 @@ received bytes begin with an echo of the request, and the echo must be removed. 
 answer has arrived and the connection is quiet.
 """
 
-import importlib
 import io
 import logging
 import os
@@ -91,7 +90,8 @@ class SerialLine:
         if url.startswith(SOCKET_SCHEMES) and urlsplit(url).port is None:  # ValueError for a wrong port
             raise ValueError(f"expected a port number, as in {url.rstrip('/:')}:7000")
         # pyserial is imported only here, so programs that open no port do not wait for the import.
-        serial = importlib.import_module("serial")
+        import serial
+
         if url.startswith("tcp://"):  # pyserial has another name for this scheme
             url = url.replace("tcp://", "socket://", 1)
         # The timeout of an attempt to read never changes, because RFC 2217 would negotiate all settings again.
@@ -102,7 +102,7 @@ class SerialLine:
         # Lines that exist only inside pyserial have no file descriptor.
         self._descriptor: int | None = None
         with suppress(AttributeError, io.UnsupportedOperation):
-            self._descriptor = int(self._serial.fileno())
+            self._descriptor = self._serial.fileno()
         # Make the system leave the signal DTR of a terminal set when the terminal is closed.
         if self._descriptor is not None and os.isatty(self._descriptor):
             attributes = termios.tcgetattr(self._descriptor)

@@ -89,7 +89,14 @@ class MeasuredPresses:
     def __post_init__(self) -> None:
         """Check the names of the electrodes, the shapes of the arrays and all values."""
         _check_electrodes(self.electrodes)
-        self._check_shapes()
+        count = len(self.lines)
+        expected = ((count, len(CONTACT)), (count, len(self.electrodes)), (count,), (count,))
+        shapes = tuple(array.shape for array in (self.contact, self.charge_pC, self.position_std_mm, self.force_std))
+        if shapes != expected:
+            raise PressError(
+                "contact, charge_pC, position_std_mm and force_std: expected arrays of the shapes "
+                f"{expected}, got {shapes}"
+            )
         self._check_values()
 
     def __len__(self) -> int:
@@ -163,21 +170,6 @@ class MeasuredPresses:
         columns = dict(zip(CONTACT, self.contact.T, strict=True))  # x_mm, y_mm and force_N
         columns |= dict(zip(self.electrodes, self.charge_pC.T, strict=True))
         return columns | {"position_std_mm": self.position_std_mm, "force_std": self.force_std}
-
-    def _check_shapes(self) -> None:
-        """Check that all arrays have one row for each press, and that there is one charge for each electrode.
-
-        Raises:
-            PressError: If an array has another shape.
-        """
-        count = len(self.lines)
-        expected = ((count, len(CONTACT)), (count, len(self.electrodes)), (count,), (count,))
-        shapes = tuple(array.shape for array in (self.contact, self.charge_pC, self.position_std_mm, self.force_std))
-        if shapes != expected:
-            raise PressError(
-                "contact, charge_pC, position_std_mm and force_std: expected arrays of the shapes "
-                f"{expected}, got {shapes}"
-            )
 
     def _check_values(self) -> None:
         """Check the values of all presses.

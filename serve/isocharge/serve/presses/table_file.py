@@ -202,7 +202,12 @@ class CsvTable:
                 continue
             if len(line_numbers) == max_rows:  # the arrays already contain as many rows as are allowed
                 raise self.error(f": expected at most {max_rows:,} presses, got more; split the file")
-            self._check_cell_count(line_number, cells)
+            additional_cells = cells[len(self.header) :]  # may be blank
+            if len(cells) < len(self.header) or "".join(additional_cells).strip():
+                raise self.error(
+                    f", line {line_number}: expected {len(self.header)} cells as in the header, got "
+                    f"{len(cells)}: {shown(cells)}"
+                )
             line_numbers.append(line_number)
             for name, column_index in column_indices.items():
                 cell = cells[column_index].strip()
@@ -215,22 +220,14 @@ class CsvTable:
                 numbers.append(number)
             # The columns that are not read may show, too, that the mark of the numbers is a decimal mark.
             self._is_mark_decimal = self._is_mark_decimal or self._has_fraction(cells)
-        self._check_mark()
-        rows = np.asarray(numbers, dtype=np.float64).reshape(len(line_numbers), len(column_indices))
-        values = dict(zip(column_indices, rows.T, strict=True))
-        return NumberColumns(values, line_numbers)
-
-    def _check_mark(self) -> None:
-        """Check that a number of the file has shown that the mark of the numbers is a decimal mark.
-
-        Raises:
-            InputError: If the mark may also be a separator of thousands.
-        """
         if self._mark and not self._is_mark_decimal:
             raise self.error(
                 f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
                 "write commas between the columns, decimal points and no separators of thousands"
             )
+        rows = np.asarray(numbers).reshape(len(line_numbers), len(column_indices))
+        values = dict(zip(column_indices, rows.T, strict=True))
+        return NumberColumns(values, line_numbers)
 
     def _cell_advice(self, cell: str) -> str:
         """Return advice for a cell that is not a number, for the end of an error message; empty if there is none."""
@@ -276,23 +273,6 @@ class CsvTable:
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
 
-    def _check_cell_count(self, line_number: int, cells: list[str]) -> None:
-        """Check that a row has as many cells as the header. Additional blank cells are accepted.
-
-        Args:
-            line_number: Number of the line, for the error message.
-            cells: Cells of the row.
-
-        Raises:
-            InputError: If the row has too few cells, or additional cells that are not blank.
-        """
-        additional_cells = cells[len(self.header) :]
-        if len(cells) < len(self.header) or "".join(additional_cells).strip():
-            raise self.error(
-                f", line {line_number}: expected {len(self.header)} cells as in the header, got "
-                f"{len(cells)}: {shown(cells)}"
-            )
-
     def _header_error(self, reason: str, names: Sequence[str]) -> InputError:
         """Return the error for a wrong header.
 
@@ -308,43 +288,33 @@ class CsvTable:
         """Check each line of a text, and yield the lines without the byte order mark at the beginning of the text.
 
         Args:
-            lines: Lines of the text, each with its line end.
+            lines: Lines of the text, each with its line end. Each byte that is not UTF-8 was replaced by a surrogate,
+                as `surrogateescape` does.
 
         Raises:
-            InputError: If the lines are not text in UTF-8, or a line is too long.
+            InputError: If the file is a Parquet file, the lines are not text in UTF-8, or a line is too long.
         """
         line_number = 0
         try:
             for line_number, line in enumerate(lines, start=1):
-                self._check_line(line_number, line)
+                if line_number == 1 and line.startswith(_PARQUET_START):
+                    raise self.error(
+                        ": expected a CSV file, got a Parquet file; convert it to CSV, for example in Python with "
+                        "pandas.read_parquet(FILE).to_csv(NEW, index=False)"
+                    )
+                wrong_character = _WRONG_BYTE.search(line)
+                if wrong_character:  # the file is binary, or text in another encoding
+                    wrong_byte = ord(wrong_character[0]) & 0xFF  # the surrogate U+DCxx stands for the byte 0xxx
+                    raise self.error(
+                        f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: export the file as "
+                        "CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > "
+                        "NEW.csv"
+                    )
                 yield line.removeprefix("\ufeff") if line_number == 1 else line
         except InputError:  # is a ValueError, too
             raise
         except ValueError as cause:  # the next line is too long
             raise self.error(f", line {line_number + 1}: not CSV text in UTF-8 ({cause})") from cause
-
-    def _check_line(self, line_number: int, line: str) -> None:
-        """Check that a line is text in UTF-8.
-
-        Args:
-            line_number: Number of the line; 1 for the first line of the file.
-            line: The line. Each byte that is not UTF-8 was replaced by a surrogate, as `surrogateescape` does.
-
-        Raises:
-            InputError: If the file is a Parquet file, or the line contains a byte that is not text in UTF-8.
-        """
-        if line_number == 1 and line.startswith(_PARQUET_START):
-            raise self.error(
-                ": expected a CSV file, got a Parquet file; convert it to CSV, for example in Python with "
-                "pandas.read_parquet(FILE).to_csv(NEW, index=False)"
-            )
-        wrong_character = _WRONG_BYTE.search(line)
-        if wrong_character:  # the file is binary, or text in another encoding
-            wrong_byte = ord(wrong_character[0]) & 0xFF  # the surrogate U+DCxx stands for the byte 0xxx
-            raise self.error(
-                f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: export the file as CSV in "
-                "UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > NEW.csv"
-            )
 
     def _numbered_rows(self, lines: Iterable[str], lines_above: int) -> Iterator[tuple[int, list[str]]]:
         """Yield the line number and the cells of each row that is neither blank nor a comment.

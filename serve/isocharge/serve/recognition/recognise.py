@@ -90,7 +90,10 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
     # It is not known which of the constant bytes is the first byte of a frame, so that the frames may begin at several
     # distances from `division.starts`. Find the checksums that fit at each distance.
     has_sync = division.framing == SYNC
-    distances = _possible_distances(division) if has_sync else [0]
+    distances: list[int] = [0]
+    if has_sync:
+        # A frame begins with its sync pattern. Each byte that may belong to the pattern may be the first byte.
+        distances = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist()
     rows_at = {distance: division.rows(distance) for distance in distances}
     checks = [(distance, check) for distance, rows in rows_at.items() for check in find_checks(rows)]
     if not checks:
@@ -108,7 +111,11 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
         parts = parts_of_order[order]
         parts_at_each_byte = parts[distance:] + parts[:distance]
         rows = rows_at[distance]
-        sync_lengths = _possible_sync_lengths(rows) if has_sync else [0]
+        sync_lengths: Sequence[int] = [0]
+        if has_sync:
+            # The first byte always belongs to the pattern, even if damaged frames hide that it is constant.
+            max_sync_length = max(1, count_leading(_may_be_sync(rows)))
+            sync_lengths = range(1, max_sync_length + 1)
         frame_score, best_parts, sync_length = split_frame(
             parts_at_each_byte[: length - check.size], sync_lengths, check.start
         )
@@ -131,24 +138,6 @@ def _scored_layouts(division: FrameDivision, seconds: float) -> Iterator[tuple[f
         covered_share = division.covered_share
         score = covered_share * frame_score / length + (1.0 - covered_share) * Weights.noise
         yield score, layout
-
-
-def _possible_distances(division: FrameDivision) -> list[int]:
-    """Return the possible distances of the beginnings of the frames from `division.starts`, bytes.
-
-    A frame begins with its sync pattern. Each byte that may belong to the pattern may therefore be the first byte.
-    """
-    distances: list[int] = np.flatnonzero(_may_be_sync(division.rows()))[:MAX_CONSTANT_BYTES].tolist()
-    return distances
-
-
-def _possible_sync_lengths(rows: Bytes) -> range:
-    """Return the possible lengths of the sync pattern at the beginning of the frames, bytes.
-
-    The first byte always belongs to the pattern, even if damaged frames hide that it is constant.
-    """
-    max_length = max(1, count_leading(_may_be_sync(rows)))
-    return range(1, max_length + 1)
 
 
 def _may_be_sync(rows: Bytes) -> Booleans:

@@ -134,7 +134,7 @@ class LivePage(Application):
             access: Check of the token, and of the web page that has sent a request.
             is_recording: Whether the stream is a recording.
         """
-        self._electrodes = tuple(description["electrodes"])
+        self._electrodes = description["electrodes"]
         dtype = sample_type(self._electrodes)
         self.tape: Tape = RecordedTape(dtype) if is_recording else Tape(dtype)
         self.act: Callable[[Action], None] | None = None

@@ -94,9 +94,7 @@ def random_layouts(case: DesignCase) -> list[Array]:
     # Squares far outside the presses are of little use. They are only allowed if the squares do not fit otherwise.
     useful_radius = case.radius + EXTENT * case.sensor.film.radius
     allowed_radius = case.sensor.film.inner_radius - RIM_DISTANCE - 0.5 * case.square_side
-    layouts = _layouts_within(min(useful_radius, allowed_radius), case)
-    if not layouts:
-        layouts = _layouts_within(allowed_radius, case)
+    layouts = _layouts_within(min(useful_radius, allowed_radius), case) or _layouts_within(allowed_radius, case)
     if not layouts:
         raise InputError(
             f"found no layout of {case.new_count} new squares of {case.square_side:g} mm within "
@@ -210,7 +208,7 @@ class Search:
             if errors.max() < best_errors.max():
                 best_positions = positions
                 best_errors = errors
-        return Layout(best_positions, float(best_errors.max()))
+        return Layout(best_positions, best_errors.max())
 
     def minimise(self, presses: Array, start: Array, power: float) -> Layout:
         """Minimise a power mean of the position errors of presses.

@@ -120,7 +120,7 @@ class Blocks:
 
         # The nodes of an element form a square grid. The coordinate xi varies fastest.
         line_nodes = lobatto_nodes(resolution.order)
-        xi, eta = np.meshgrid(line_nodes, line_nodes, indexing="xy")
+        xi, eta = np.meshgrid(line_nodes, line_nodes)
         self.xi = xi.ravel()
         self.eta = eta.ravel()
 
@@ -132,8 +132,8 @@ class Blocks:
         around the core polygon.
         """
         if self.topology.is_curved:
-            return slice(0, self.n_quad + self.n_sector)
-        return slice(0, self.n_quad)
+            return slice(self.n_quad + self.n_sector)
+        return slice(self.n_quad)
 
     @property
     def copies(self) -> int:

@@ -162,30 +162,17 @@ def sector_angles(
     radius_ratio = circle_radius / inner_radius
     ray_angle = _ray_angles(blocks, inner_points - ray_origin, radius_ratio)
 
-    # Compute the intersections of the rays with the circle, relative to the centre of the circle.
+    # Compute the intersections of the rays with the circle, relative to the centre of the circle. The length t of a ray
+    # is the positive solution of |origin + t ray|^2 = circle_radius^2.
+    origin = ray_origin - circle_centre
     ray = np.exp(1j * ray_angle)  # unit vectors, shape (..., n_sector + 1)
-    intersection = _intersections_with_circle(ray_origin - circle_centre, ray, circle_radius)
+    projection = origin * ray.real
+    length = np.sqrt(projection**2 + circle_radius**2 - origin**2) - projection
+    intersection = origin + ray * length
 
     # Convert the angles on the film into angles in the template plane.
     film_angle = np.unwrap(np.angle(intersection))  # without jumps at pi
     return stretch_angles(film_angle, stretch)
-
-
-def _intersections_with_circle(origin: Array, ray: Complexes, radius: Array) -> Complexes:
-    """Compute the points at which rays that start inside a circle around the origin meet this circle.
-
-    Args:
-        origin: Positions of the origins of the rays on the x axis.
-        ray: Unit vectors of the rays as complex numbers.
-        radius: Radii of the circles.
-
-    Returns:
-        Points x + iy. Their shape results from broadcasting the arguments with each other.
-    """
-    # The length t of a ray is the positive solution of |origin + t ray|^2 = radius^2.
-    projection = origin * ray.real
-    length = np.sqrt(projection**2 + radius**2 - origin**2) - projection
-    return origin + ray * length
 
 
 def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) -> Array:

@@ -6,7 +6,7 @@ computed only when they are first needed.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -229,7 +229,7 @@ def place(
     # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis.
     x, y = at
     direction = math.atan2(y, x)
-    distance = np.array(np.hypot(x, y))
+    distance = np.hypot(x, y)
     oval = film_oval(film, direction)
     placement = Placement.of(template, probe.rotated(-direction), distance, film.radius, layer, oval=oval)
     return PlacedMesh(template, placement, layer)
@@ -273,13 +273,13 @@ class _ElementRule(NamedTuple):
         return determinant * self.weights
 
 
-@lru_cache(maxsize=16)
+@cache
 def _gauss_rule(order: int, points_per_side: int) -> _ElementRule:
     """Return the Gauss rule for elements of a given order, with the given number of points in each direction."""
     return _ElementRule.of(order, *gauss_reference_square(points_per_side))
 
 
-@lru_cache(maxsize=16)
+@cache
 def _lobatto_rule(order: int) -> _ElementRule:
     """Return the Gauss-Lobatto rule, whose points are the nodes, for elements of a given order."""
     return _ElementRule.of(order, *tensor_rule(lobatto_nodes(order), lobatto_quadrature(order)))

@@ -151,9 +151,7 @@ class Placement:
         The index None adds a first axis of length one.
         """
         arrays: dict[str, Any] = {
-            field.name: np.asarray(getattr(self, field.name))[indices]
-            for field in fields(self)
-            if field.name != "probe"
+            field.name: getattr(self, field.name)[indices] for field in fields(self) if field.name != "probe"
         }
         return replace(self, **arrays)
 
@@ -206,7 +204,7 @@ class Placement:
         """
         # Between the innermost circle and the rim, the displacement changes linearly with the depth.
         rim_displacement = oval_displacement(points, self.oval[..., None])
-        displacement: Complexes = _interpolate(self.footprint_displacement[..., None], rim_displacement, depth)
+        displacement: Complexes = interpolate(self.footprint_displacement[..., None], rim_displacement, depth)
         return displacement
 
     def to_circular_film(self, points: Complexes) -> Complexes:
@@ -231,19 +229,6 @@ class Placement:
             if np.abs(circular_points - previous).max(initial=0.0) < 1e-15:
                 break
         return circular_points
-
-    def boundary(self, parameter: Array) -> Complexes:
-        """Compute points of the boundary of a curved footprint on the circular film.
-
-        Args:
-            parameter: Boundary parameters of the points, from 0 to 2 pi, shape (..., n).
-
-        Returns:
-            Points x + iy of the circular film, shape (..., n), in film radii.
-        """
-        assert isinstance(self.probe, CurvedProbe)
-        centroid = self.corners[..., -1]
-        return _on_film(self.probe.boundary(parameter), centroid, self.rotation_and_scale)
 
     def element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes of all elements for a single placement.
@@ -275,7 +260,7 @@ class Placement:
         # only entry, which has the index 0, once for each element.
         placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
         inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
-        points: Complexes = _interpolate(inner, outer, radial)
+        points: Complexes = interpolate(inner, outer, radial)
         return points
 
     def sides(self, blocks: Blocks, element: Integers, angular: Array) -> tuple[Complexes, Complexes]:
@@ -295,8 +280,8 @@ class Placement:
         # corners of an element (index i) is a weighted sum of the corners and the centroid of the core polygon (j).
         element_corners = np.einsum("nij,nj->in", blocks.inner_corner_weights[element], self.corners)
         inner_first, inner_last, outer_first, outer_last = element_corners[:, :, None]  # each of shape (n, 1)
-        inner = _interpolate(inner_first, inner_last, angular)
-        outer = _interpolate(outer_first, outer_last, angular)
+        inner = interpolate(inner_first, inner_last, angular)
+        outer = interpolate(outer_first, outer_last, angular)
 
         # The elements are numbered from the inside to the outside: first the `n_quad` elements of the core polygon,
         # whose sides are straight, and then `n_sector` elements of each layer. The sector of an element is its position
@@ -305,7 +290,10 @@ class Placement:
         sector = (element[:, None] - blocks.n_quad) % blocks.n_sector
 
         # The outer sides of the last layer lie on the innermost circle.
-        circle_points = self._circle_points(sector, angular)
+        first_angle = np.take_along_axis(self.circle_angles, sector, axis=1)
+        last_angle = np.take_along_axis(self.circle_angles, sector + 1, axis=1)
+        angle = interpolate(first_angle, last_angle, angular)  # in the template plane
+        circle_points = self.to_film(self.template_radius[:, None] * np.exp(1j * angle))
         outer[in_last_layer] = circle_points[in_last_layer]
 
         # If there are two layers, the boundary of the footprint separates them.
@@ -313,27 +301,12 @@ class Placement:
             in_first_layer = (element >= blocks.n_quad) & ~in_last_layer
             first_parameter = blocks.boundary_parameter[sector]
             last_parameter = blocks.boundary_parameter[sector + 1]
-            boundary_points = self.boundary(_interpolate(first_parameter, last_parameter, angular))
+            assert isinstance(self.probe, CurvedProbe)
+            boundary = self.probe.boundary(interpolate(first_parameter, last_parameter, angular))
+            boundary_points = _on_film(boundary, self.corners[..., -1], self.rotation_and_scale)
             outer[in_first_layer] = boundary_points[in_first_layer]
             inner[in_last_layer] = boundary_points[in_last_layer]
         return inner, outer
-
-    def _circle_points(self, sector: Integers, angular: Array) -> Complexes:
-        """Compute points of the circular film that lie on the innermost circle of the mesh.
-
-        The object contains n placements.
-
-        Args:
-            sector: Index of the sector that contains the points, shape (n, 1).
-            angular: Angular coordinates of the points in their sectors from 0 to 1, shape (n, k) or (1, k).
-
-        Returns:
-            Points x + iy of the circular film, shape (n, k), in film radii.
-        """
-        first_angle = np.take_along_axis(self.circle_angles, sector, axis=1)
-        last_angle = np.take_along_axis(self.circle_angles, sector + 1, axis=1)
-        angle = _interpolate(first_angle, last_angle, angular)  # in the template plane
-        return self.to_film(self.template_radius[:, None] * np.exp(1j * angle))
 
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes in the rings, which lie between the innermost circle and the rim.
@@ -348,13 +321,13 @@ class Placement:
         radial, angular = _unit_coordinates(blocks)
         inner_depth = self.ring_depths[:-1, None, None]
         outer_depth = self.ring_depths[1:, None, None]
-        depth = _interpolate(inner_depth, outer_depth, radial)  # shape (n_ring, 1, n_local)
+        depth = interpolate(inner_depth, outer_depth, radial)  # shape (n_ring, 1, n_local)
 
         # The angle of a node and the logarithm of its radius are interpolated linearly with respect to the depth,
         # between the innermost circle and the rim. On the rim, the logarithm of the radius is 0.
-        circle_angle = _interpolate(self.circle_angles[:-1, None], self.circle_angles[1:, None], angular)
-        rim_angle = _interpolate(self.rim_angles[:-1, None], self.rim_angles[1:, None], angular)
-        angle = _interpolate(circle_angle, rim_angle, depth)  # shape (n_ring, n_sector, n_local)
+        circle_angle = interpolate(self.circle_angles[:-1, None], self.circle_angles[1:, None], angular)
+        rim_angle = interpolate(self.rim_angles[:-1, None], self.rim_angles[1:, None], angular)
+        angle = interpolate(circle_angle, rim_angle, depth)  # shape (n_ring, n_sector, n_local)
         log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
         circular_points = self.to_film(template_points)
@@ -376,7 +349,7 @@ def _on_film(footprint_points: Complexes, centroid: Array | Complexes, rotation_
     return centroid[..., None] + rotation_and_scale[..., None] * footprint_points
 
 
-def _interpolate(start: Any, end: Any, share: Array) -> Any:
+def interpolate(start: Any, end: Any, share: Array) -> Any:
     """Interpolate linearly between real or complex numbers: the share 0 yields `start`, and the share 1 yields `end`.
 
     The three arguments are broadcast with each other.

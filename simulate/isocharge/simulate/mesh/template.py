@@ -16,7 +16,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array, Booleans, Complexes, Integers
 from isocharge.simulate.mesh.blocks import Blocks, Resolution
-from isocharge.simulate.mesh.placement import Placement
+from isocharge.simulate.mesh.placement import Placement, interpolate
 from isocharge.simulate.numerics.polygon import cross_product
 from isocharge.simulate.sensor.footprint import FootprintTopology
 from isocharge.simulate.sensor.probe import RoundProbe
@@ -156,7 +156,7 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     # changes linearly with the depth, from its value on the innermost circle to its value on the rim.
     circle_angles = placement.circle_angles.T[..., None]  # shape (n_sector + 1, k, 1)
     rim_angles = placement.rim_angles.T[..., None]
-    side_angles = circle_angles + depth * (rim_angles - circle_angles)  # shape (n_sector + 1, k, n)
+    side_angles = interpolate(circle_angles, rim_angles, depth)  # shape (n_sector + 1, k, n)
 
     # Find the sectors. If the whole film is meshed, add full turns such that each angle lies within one turn after the
     # first side.
@@ -273,7 +273,7 @@ def _local_coordinates(placement: Placement, blocks: Blocks, points: Complexes, 
         radial, angular = coordinates
         shifted_angular = angular[:, None] + np.array([0.0, -step_size, step_size])
         inner, outer = placement.sides(blocks, element, shifted_angular)
-        shifted_points = inner + radial[:, None] * (outer - inner)
+        shifted_points = interpolate(inner, outer, radial[:, None])
         current, before, after = shifted_points.T
         residual = current - points
         radial_derivative = outer[:, 0] - inner[:, 0]

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebpts1
@@ -12,7 +12,7 @@ from scipy.special import eval_legendre, roots_jacobi
 from isocharge.common.arrays import Array, Integers
 
 
-@lru_cache(maxsize=32)
+@cache
 def lobatto_nodes(order: int) -> Array:
     """Return the Gauss-Lobatto-Legendre nodes on the interval [-1, 1].
 
@@ -30,7 +30,6 @@ def lobatto_nodes(order: int) -> Array:
     return _read_only(np.concatenate([[-1.0], interior, [1.0]]))
 
 
-@lru_cache(maxsize=32)
 def lobatto_quadrature(order: int) -> Array:
     """Return the quadrature weights of the Gauss-Lobatto-Legendre nodes on the interval [-1, 1].
 
@@ -42,10 +41,10 @@ def lobatto_quadrature(order: int) -> Array:
     Returns:
         Weights, shape (order + 1,). The weights add up to 2, the length of the interval.
     """
-    return _read_only(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
+    return np.asarray(2.0 / (order * (order + 1) * eval_legendre(order, lobatto_nodes(order)) ** 2))
 
 
-@lru_cache(maxsize=32)
+@cache
 def modal_matrix(order: int) -> Array:
     """Return the matrix that converts the values of a polynomial at the Gauss-Lobatto nodes into Legendre coefficients.
 
@@ -179,7 +178,7 @@ def _tensor_product(xi_values: Array, eta_values: Array) -> Array:
     return products.reshape(len(xi_values), eta_values.shape[1] * xi_values.shape[1])
 
 
-@lru_cache(maxsize=32)
+@cache
 def gauss_line(count: int) -> tuple[Array, Array]:
     """Return the points and weights of the Gauss-Legendre rule on the interval [0, 1].
 
@@ -193,7 +192,7 @@ def gauss_line(count: int) -> tuple[Array, Array]:
     return _read_only(0.5 * (points + 1.0)), _read_only(0.5 * weights)
 
 
-@lru_cache(maxsize=32)
+@cache
 def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
     """Return the points and weights of the Gauss-Legendre rule on the square [-1, 1]^2.
 
@@ -208,7 +207,7 @@ def gauss_reference_square(count: int) -> tuple[Array, Array, Array]:
 
 
 def tensor_rule(points: Array, weights: Array) -> tuple[Array, Array, Array]:
-    """Return the quadrature rule for the square [-1, 1]^2 that combines two equal rules for the interval [-1, 1].
+    """Return the quadrature rule for a square that combines two equal rules for the interval along its sides.
 
     Args:
         points: Points of the rule for the interval, shape (n,).

@@ -16,7 +16,7 @@ import shapely
 from numpy.typing import ArrayLike
 
 from isocharge.common.arrays import Array, Complexes
-from isocharge.simulate.numerics.interpolation import gauss_line
+from isocharge.simulate.numerics.interpolation import gauss_line, tensor_rule
 
 MERGE_DISTANCE = 1e-9
 """Width of a strip along a boundary whose area is neglected when areas are compared, mm."""
@@ -141,10 +141,7 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
         to the area that the line represents.
     """
     # Coordinates s and t, and weights of the points in the unit square, each of shape (count^2,)
-    line_points, line_weights = gauss_line(count)
-    s = np.repeat(line_points, count)
-    t = np.tile(line_points, count)
-    square_weights = np.outer(line_weights, line_weights).ravel()
+    t, s, square_weights = tensor_rule(*gauss_line(count))
 
     # Map the points into the quadrilaterals. The digits in the name of a corner are its coordinates s and t.
     z00, z10, z11, z01 = corners.T[:, :, None]  # each of shape (n, 1)

@@ -39,7 +39,7 @@ def identification_picture(identification: Identification) -> Figure:
     figure = new_figure(16.0, 5.2)
     *map_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     limit_maps = (identification.maps[0], identification.maps[-1])  # for the smallest and the largest force
-    smallest = min(float(limit_map.position.min()) for limit_map in limit_maps)
+    smallest = min(limit_map.position.min() for limit_map in limit_maps)
     norm = LogNorm(smallest, max(area.error, 2.0 * smallest))  # the scale must not be empty
     for axes, limit_map in zip(map_axes, limit_maps, strict=True):
         positions = limit_map.rings.position.reshape(-1, 2)
@@ -103,7 +103,7 @@ def error_maps_picture(design: Design) -> Figure:
         layouts.insert(0, (case.sensor, design.errors_before))  # the map of the initial layout is on the left
 
     # Both maps have the same colour scale and the same axes, which show all electrodes.
-    smallest = min(float(errors.with_nuisances.min()) for _, errors in layouts)
+    smallest = min(errors.with_nuisances.min() for _, errors in layouts)
     norm = LogNorm(smallest, MAX_ERROR_RATIO * smallest)
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
     all_axes = figure.subplots(1, len(layouts), squeeze=False, sharex=True, sharey=True)[0]
@@ -115,7 +115,7 @@ def error_maps_picture(design: Design) -> Figure:
         rms = np.sqrt(np.mean(position_error**2))
         axes.set_title(f"{sensor.name}\nworst {position_error.max():.3g} mm (cross), rms {rms:.3g} mm")
 
-    _add_colour_bar(figure, coloured_area, list(all_axes))
+    _add_colour_bar(figure, coloured_area, all_axes)
     nuisances = "without nuisances" if case.nuisances == NO_NUISANCES else "with nuisances"
     figure.suptitle(f"{case.force:g} N, {case.probe.notation}, noise {case.noise.name}, {nuisances}")
     return figure

@@ -75,7 +75,7 @@ def draw_working_area(axes: Any, radius: float, label: str = "") -> None:
     draw_circle(axes, radius, ls=":", color=INK, label=label)
 
 
-def frame_film(axes: Any, sensor: Sensor, radius: float, title: str = "") -> None:
+def frame_film(axes: Any, sensor: Sensor, radius: float, title: str) -> None:
     """Scale and label axes such that they show all electrodes and a circle around the centre of the film.
 
     Args:

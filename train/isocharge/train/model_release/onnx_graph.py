@@ -5,7 +5,7 @@ Therefore, only `FoldedNetwork` defines the structure of the graph. The reader r
 wrote. Before a graph is released, its outputs in single precision are compared with its outputs in double precision.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import onnx
@@ -27,7 +27,7 @@ from isocharge.train.training.folded_network import (
 )
 
 
-def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
+def write_graph(network: FoldedNetwork, properties: dict[str, str]) -> bytes:
     """Write a network as an ONNX file.
 
     Args:
@@ -39,7 +39,7 @@ def write_graph(network: FoldedNetwork, properties: Mapping[str, str]) -> bytes:
         3], `contact_correlation` [n, 3] and `misfit` [n, 1]. All tensors are float32.
     """
     model = network.onnx_model()
-    helper.set_model_props(model, dict(properties))
+    helper.set_model_props(model, properties)
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
 
@@ -66,7 +66,7 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
     try:
         network = _recover_network(model.graph)
         written = network.onnx_model()
-        is_equal = written.graph == model.graph and list(written.opset_import) == list(model.opset_import)
+        is_equal = written.graph == model.graph and written.opset_import == model.opset_import
     except (LookupError, ValueError, StopIteration):  # the constants are too few, or their shapes do not fit a network
         is_equal = False
     if not is_equal:
@@ -200,7 +200,7 @@ def check_graph(
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
     # Find the presses for which every difference is less than a quarter of the tolerance, because another runtime
     # rounds differently.
-    all_floors = FLOORS | {"contact": tuple(floors), "contact_std": tuple(floors)}
+    all_floors = FLOORS | {"contact": floors, "contact_std": floors}
     is_reproducible: Booleans = np.full(len(golden_charge), True)
     exact_outputs = compute_exact(golden_charge.astype(float))
     for exact, (name, output) in zip(exact_outputs, run(session, golden_charge).items(), strict=True):
@@ -236,7 +236,7 @@ def _choose_golden_charges(compute_exact: OutputFunction, presses: LabelledPress
     """
     _, std, *_ = compute_exact(presses.charge)
     position_std = std[:, 0] + std[:, 1]  # a measure of the uncertainty of x and y
-    well_determined_presses = presses[np.flatnonzero(position_std <= np.median(position_std))]
+    well_determined_presses = presses[position_std <= np.median(position_std)]
 
     chosen_rows = np.linspace(0, len(well_determined_presses) - 1, 3 * N_GOLDEN // 4).astype(int)
     press_charge = well_determined_presses[chosen_rows].noisy(noise, seed=2)

@@ -71,7 +71,6 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
         fitted: The network, its sensor and its presses.
     """
     electrodes = metadata.electrodes
-    sensor_name = metadata.sensor["name"]
 
     truth_text = MEASURED_TRUTH if "measured" in metadata.made_with else SIMULATED_TRUTH
     whites, gains = metadata.noise.for_each_electrode(len(electrodes))
@@ -89,7 +88,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     cautions_text = "".join(f"- {caution}.\n" for caution in metadata.made_with.get("cautions", ()))
     return f"""# {metadata.name}, version {metadata.version}
 
-Estimates the position and the force of one press from the charges of the sensor `{sensor_name}`.
+Estimates the position and the force of one press from the charges of the sensor `{metadata.sensor["name"]}`.
 
 | | |
 |---|---|
@@ -127,7 +126,7 @@ The misfit is the distance of the charges from those of the nearest single conta
 def _area_text(fitted: Fitted) -> str:
     """Return a text about the working area."""
     if isinstance(fitted.domain, PressedArea):
-        width, height = np.ptp(np.array(fitted.domain.corners), axis=0)
+        width, height = np.ptp(fitted.domain.corners, axis=0)
         return f"{width:.4g} mm x {height:.4g} mm, the outline of the presses; corners in the metadata"
     return f"within {fitted.domain.radius:g} mm of the centre"
 

@@ -110,8 +110,7 @@ def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
     yield "|" + "---|" * TEXT_COLUMNS + "--:|" * n_number_columns  # numbers are aligned to the right
     for section in sections:
         if section.limits:
-            limit_cells = _error_cells(section.limits)
-            yield _table_line([section.sensor, "*Cramér-Rao limit, unbiased*", "", *limit_cells, ""])
+            yield _table_line([section.sensor, "*Cramér-Rao limit, unbiased*", "", *_error_cells(section.limits), ""])
         for record in sorted(section.methods, key=_position_error):
             name = record.name
             if record.answered < 1.0:
