@@ -336,7 +336,7 @@ def replay_command(
     # too, unless the user has chosen one model for the whole recording.
     touch = TouchStream(predictor, board, frame_id=recording.name)
     load = None if model else lambda label: Predictor(find_labelled_model(label, models))
-    play = partial(replay, recording, touch, real_time=real_time, yields_all=device is not None, load=load)
+    play = partial(replay, recording, touch, real_time=real_time, yields_all=bool(device), load=load)
 
     outputs = command_outputs(output, touch, is_live=False)
     with (
