@@ -28,7 +28,7 @@ class StageRunner:
         predictor = None
         if misfit is not None:
             predictor = SimpleNamespace(predict_batch=lambda charge_pC: SimpleNamespace(misfit=misfit(charge_pC)))
-            predictor.for_noise_at_rest = lambda _: predictor
+            predictor.for_measured_noise = lambda _: predictor
         self.stages = create_stages(Setup(tuple("ABCDEFGH"[:n_electrode]), device, predictor))
 
     def advance(self, values, t_s, dt_s, *, limited=False, flags=()):

@@ -23,8 +23,8 @@ from isocharge.simulate.forward.readout import (
     MAP_COUNTS,
     NEAR_DISTANCE,
     ElectrodePieces,
-    charge_per_stress_of_pieces,
     contact_charges,
+    piece_charge_per_stress,
     stress_charge,
     thermal_charge,
 )
@@ -44,7 +44,7 @@ TRIANGLE = Electrode("T", ((-12.0, 4.0), (-8.0, 4.0), (-10.0, 8.0)))
 def charge_of(sensor: Sensor, stress, per_side: int = 12) -> np.ndarray:
     """Charges under a made-up stress field, a function of x and y that returns (s11, s22, s12)."""
     pieces = ElectrodePieces.of(sensor)
-    charge_per_stress = charge_per_stress_of_pieces(sensor)
+    charge_per_stress = piece_charge_per_stress(sensor)
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(PROBE, np.zeros(1), (per_side, per_side)):
         values = np.stack(np.broadcast_arrays(*stress(rule.points.real, rule.points.imag)))

@@ -84,8 +84,8 @@ class Frame:
         charge_pC: Charges after the stages that the frame has passed, shape (n_electrode,), pC. After all stages, they
             are the touch charges. None while there is no tare, and for an invalid frame.
         tare_pC: Charge at rest that was subtracted, shape (n_electrode,), pC; None without touch charges.
-        noise_pC: Standard deviation of the charges at rest, shape (n_electrode,), pC. It is set only if there is a
-            tare.
+        noise_pC: Measured noise of the charges as a standard deviation, shape (n_electrode,), pC. It is the noise at
+            rest, and grows during a touch if the board sends currents. It is set only if there is a tare.
         is_contact: Whether something touches the film.
         warming_pC: Part of the charges that is due to a warming of the film since the previous frame, shape
             (n_electrode,) or one number for all electrodes, pC. This part was subtracted from `charge_pC`.

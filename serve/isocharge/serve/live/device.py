@@ -73,7 +73,7 @@ def predictor_for(device: Device, predictor: Predictor) -> Predictor:
 class Prediction(Stage):
     """Predicts the contact of each frame with the present model, for the noise that the device file states.
 
-    If the noise at rest is much larger, the standard deviations are computed for the noise at rest.
+    If the measured noise is much larger, the standard deviations are computed for the measured noise.
     """
 
     section = "noise"
@@ -94,14 +94,14 @@ class Prediction(Stage):
     def step(self, frame: Frame) -> None:
         """Predict the contact of a frame, unless nothing touches the film or the frame has no charges.
 
-        The predictor for the noise at rest is stored in the setup for the later stages. The error of an estimated
+        The predictor for the measured noise is stored in the setup for the later stages. The error of an estimated
         warming is added to the uncertainty of the contact.
         """
         if frame.charge_pC is None or not frame.is_contact:
             return
         if frame.noise_pC is not self._noise_pC:  # the film was tared, or the board sends currents
             self._noise_pC = frame.noise_pC
-            self._setup.predictor = self._predictor.for_noise_at_rest(frame.noise_pC)
+            self._setup.predictor = self._predictor.for_measured_noise(frame.noise_pC)
         predictor = self._setup.model
         frame.contact, frame.contact_flags = predictor.predict_with_flags(frame.charge_pC)
         if frame.warming_error_pC is not None:

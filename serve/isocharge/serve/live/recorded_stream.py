@@ -211,16 +211,16 @@ def replay(
 ) -> Iterator[PredictionRecord]:
     """Compute the records of a recording again from its chunks, and yield the records.
 
-    The replay also executes the recorded requests, such as a new tare. For each chunk, the replay yields at most the
-    number of records of the recorded stream, unless `yields_all` is true. A line with a record therefore only means
-    that the replay yields its next record.
+    The replay also executes the recorded requests, such as a new tare. For each chunk, the replay yields the same
+    number of records as the recorded stream. A line with a record therefore only means that the replay yields its next
+    record. If `yields_all` is true, the replay instead yields all records of each chunk at once.
 
     Args:
         recording: Recording whose chunks are processed.
         stream: New stream with the model and the device of the recorded stream.
         real_time: Whether to wait before each chunk, so that the replay takes as long as the recording.
-        yields_all: Whether to yield all records of each chunk, also those that the recording does not contain, because
-            the stream has other settings than the recorded stream.
+        yields_all: Whether to yield all records of each chunk, also those that the recording does not contain. This is
+            useful if the settings of the stream differ from those of the recorded stream.
         load: Function that loads the model with a given label. It is called when the recorded stream has changed its
             model. If `load` is None, all records are computed with the first model.
         on_marker: Function that is called with each marker. The call takes place between the records that come before
@@ -242,8 +242,8 @@ def replay(
 
         # The line is no record, so that all recorded records of the previous chunk were yielded. If the recording
         # program ended within that chunk, its last records are missing in the recording. The stream processes the whole
-        # chunk all the same, but `deque` discards the remaining records, and is empty.
-        yield from records if yields_all else deque(records, maxlen=0)
+        # chunk all the same, but `deque` discards the remaining records.
+        deque(records, maxlen=0)
         chunk = event.chunk
         if event.marker is not None:
             on_marker(event.marker)
@@ -260,4 +260,6 @@ def replay(
                 wait_s = max(0.0, due_s - time.monotonic())
                 time.sleep(min(wait_s, threading.TIMEOUT_MAX))
             records = stream.feed(chunk)
-    yield from records if yields_all else deque(records, maxlen=0)
+            if yields_all:
+                yield from records
+    deque(records, maxlen=0)

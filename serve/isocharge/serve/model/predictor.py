@@ -107,13 +107,14 @@ class Predictor:
         new_predictor.__dict__.update(self.__dict__, noise=noise, validity=validity)
         return new_predictor
 
-    def for_noise_at_rest(self, noise_pC: Array) -> "Predictor":
-        """Return a predictor for the noise at rest if this noise is much larger than the stated noise, otherwise self.
+    def for_measured_noise(self, noise_pC: Array) -> "Predictor":
+        """Return a predictor for a measured noise if it is much larger than the stated noise, and otherwise self.
 
         A noise up to 1.5 times the stated noise has no effect, because a tare measures the noise inaccurately.
 
         Args:
-            noise_pC: Standard deviation of the charges without a touch, shape (n_electrode,), pC.
+            noise_pC: Measured noise that does not depend on the charge, as a standard deviation, shape (n_electrode,),
+                pC.
         """
         white_pC = np.asarray(self.noise.white_pC)
         if (noise_pC > 1.5 * white_pC).any():

@@ -69,12 +69,13 @@ class PressErrors:
 
     @property
     def variance(self) -> Array:
-        """Variances of independent errors whose means scatter like those of the real errors, shape (n, 3).
+        """Variances with which the errors are treated as independent, shape (n, 3).
 
-        The errors of presses at one place are not independent, so the variances of their positions are multiplied.
+        Presses at one place share the error of their position. The variance of this error is therefore multiplied by
+        the number of presses at the place.
         """
         rig_variance = self.rig_std**2
-        rig_variance.T[:FORCE] *= self.presses.same_place_count  # rows: x and y of all presses
+        rig_variance[:, :FORCE] *= self.presses.same_place_count[:, np.newaxis]
         return self.noise_std**2 + rig_variance
 
     @property

@@ -338,15 +338,13 @@ class Integrator(Leak):
         # currents before and after the gap, each differs from their mean by at most half of their difference.
         error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0
         self._current_pC = current_pC
-        current_noise_pC = frame.noise_pC
         rest_ratio = max(1.0, 0.5 * self._rule.relax_s / interval_s)  # of the variances
-        frame.noise_pC = current_noise_pC * math.sqrt(rest_ratio)
+        averaging_s = max(min(self._rule.settle_s, self._inflow.learned_s), interval_s)  # T
+        touch_ratio = self._touch_count + self._touch_count**2 * interval_s / averaging_s
+        frame.noise_pC = frame.noise_pC * math.sqrt(rest_ratio + touch_ratio)
         if self._is_large(error_pC, frame):
             self._is_falsified = True
             frame.flags.append(GAP)
-        averaging_s = max(min(self._rule.settle_s, self._inflow.learned_s), interval_s)
-        touch_ratio = self._touch_count + self._touch_count**2 * interval_s / averaging_s
-        frame.noise_pC = current_noise_pC * math.sqrt(rest_ratio + touch_ratio)
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:
         """Return the charge that has arrived, minus the charge that has leaked, shape (n_electrode,), pC."""

@@ -104,7 +104,7 @@ class Warming(Stage):
             return
         if SATURATED in frame.flags:
             return
-        change_pC = self._estimate(frame, frame.charge_pC) * self._ratios
+        change_pC = self._estimate(frame.charge_pC, frame.noise_pC, frame.dt_s) * self._ratios
         frame.charge_pC = frame.charge_pC - change_pC
         frame.warming_pC = change_pC
         frame.warming_error_pC = math.sqrt(self._variance_pC2) * self._ratios
@@ -115,7 +115,7 @@ class Warming(Stage):
         if self._is_blind:
             frame.flags.append(BLIND)
 
-    def _estimate(self, frame: Frame, charge_pC: Array) -> float:
+    def _estimate(self, charge_pC: Array, noise_pC: Array, dt_s: float) -> float:
         """Update the estimate of the charge p that warming has added to each electrode, and return its change, pC.
 
         A Kalman filter computes the estimate (`_charge_pC`) and its variance (`_variance_pC2`). A change of p is
@@ -125,11 +125,12 @@ class Warming(Stage):
         distinguished from force. The estimate is then not changed.
 
         Args:
-            frame: The frame.
-            charge_pC: Its touch charges, from which the present estimate has been subtracted, shape (n_electrode,), pC.
+            charge_pC: Touch charges from which the present estimate has been subtracted, shape (n_electrode,), pC.
+            noise_pC: Measured noise of the charges, shape (n_electrode,), pC.
+            dt_s: Time since the previous frame, s.
         """
         rule = self._rule
-        self._waited_s += frame.dt_s
+        self._waited_s += dt_s
         if self._waited_s < rule.every_s - SUM_TOLERANCE_s:  # no estimate in this frame
             return 0.0
         # The common charge changes like a random walk, whose variance increases in proportion to the time.
@@ -138,7 +139,7 @@ class Warming(Stage):
 
         # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
         trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * self._ratios  # shape (trials, n_electrode)
-        predictor = self._setup.model.for_noise_at_rest(frame.noise_pC)
+        predictor = self._setup.model.for_measured_noise(noise_pC)
         squared_misfits = np.square(predictor.predict_batch(trial_charges_pC).misfit, dtype=float)
         _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
 

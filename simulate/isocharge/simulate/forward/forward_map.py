@@ -35,12 +35,7 @@ from isocharge.simulate.forward.family import (
     relative_error,
     spread_check_presses,
 )
-from isocharge.simulate.forward.readout import (
-    ChargeDensity,
-    ElectrodePieces,
-    charge_per_stress_of_pieces,
-    contact_charges,
-)
+from isocharge.simulate.forward.readout import ChargeDensity, ElectrodePieces, contact_charges, piece_charge_per_stress
 from isocharge.simulate.mechanics.theory import Theory, amplitude_squared, rotate_stress
 from isocharge.simulate.mesh.blocks import Resolution
 from isocharge.simulate.mesh.oval import film_oval
@@ -401,7 +396,7 @@ class ForwardMap:
         orientation = np.broadcast_to(orientation, len(contact))
         charges = np.empty((len(contact), len(self.electrodes), is_odd.size))
         pieces = ElectrodePieces.of(self.sensor)
-        charge_per_stress = charge_per_stress_of_pieces(self.sensor)
+        charge_per_stress = piece_charge_per_stress(self.sensor)
         with single_threaded_blas():  # faster for the many small matrices of a chunk
             chunk_size = max(1, CHUNK_SIZE // is_odd.size)
             for start in range(0, len(contact), chunk_size):

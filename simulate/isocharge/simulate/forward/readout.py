@@ -77,7 +77,7 @@ The edge readout has two kinds of pieces: lines on the left and right edges, and
 """
 
 
-def charge_per_stress_of_pieces(sensor: Sensor) -> Array:
+def piece_charge_per_stress(sensor: Sensor) -> Array:
     """Return the charge density per stress (s11, s22, s12) for each kind of piece, shape (n_kind, 3), pC/N.
 
     Args:
@@ -267,7 +267,7 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
         Charges, shape (n_electrode,), pC.
     """
     pieces = ElectrodePieces.of(sensor)
-    charge_per_stress = charge_per_stress_of_pieces(sensor)
+    charge_per_stress = piece_charge_per_stress(sensor)
     charge = np.zeros(len(sensor.electrodes))
     for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
         # `touch_stress` expects one list of points.
@@ -333,7 +333,7 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
         Charges, shape (n_electrode,), pC. They are proportional to the areas of the electrodes.
     """
     areas = np.array([electrode.area for electrode in sensor.electrodes])
-    charge_per_stress = charge_per_stress_of_pieces(sensor).sum(axis=0)  # an electrode has pieces of each kind
+    charge_per_stress = piece_charge_per_stress(sensor).sum(axis=0)  # an electrode has pieces of each kind
     tension_charge = charge_per_stress @ tension_change(sensor.film, step, 0.0)  # pC/mm^2
     return sensor.calibration.read(sensor.gains * areas * (sensor.piezo.pyro * step + tension_charge))
 
