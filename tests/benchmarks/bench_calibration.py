@@ -7,7 +7,9 @@ The films are those of `solved_films.py`: orthotropic, unevenly stretched, with 
 `--films moduli`, E1 / E2 is 1.6; with `--films tension`, the ratio of the pretensions along two axes is 3. The presses
 have errors of 0.1 mm and 1 %. All contacts are computed by the network of the model that `train calibrate` writes, from
 one frame with noise. The benchmark gives root-mean-square errors of 60 contacts, the share of the forces within two
-reported standard deviations, and the shares within the reported 95 % ellipse (x, y) and ellipsoid:
+reported standard deviations, and the shares within the reported 95 % ellipse (x, y) and ellipsoid. For a film that has
+not changed, `rejected` is the share of the checks (`serve check`) that reject the model. A check uses 24 presses with
+errors of 0.03 mm and 0.3 %.
 
 - N presses: the film has not changed.
 - offset: all 20 presses and all later contacts have an offset of 10 pC.
@@ -37,7 +39,7 @@ from shared import arguments, print_results, report_progress, whitened_errors
 from solved_films import FILMS, Unevenness, draw_film, solve_charges
 
 from isocharge.common.defaults import DEFAULT_RADIUS
-from isocharge.serve import Contact, Frame, Predictor
+from isocharge.serve import Contact, Frame, Predictor, check_presses
 from isocharge.serve.signal_chain.stage import Setup
 from isocharge.serve.tracking.film_follower import FilmFollower
 from isocharge.simulate import Circle, NoiseModel, load_sensor, local_workers
@@ -53,6 +55,11 @@ SUDDEN_TOUCHES = 20
 DRAWS = 4
 CONTACTS = 60
 PRESSES = 20
+CHECKS = 100
+CHECKED_PRESSES = 24
+CHECK_SCALE = 0.3
+"""Errors of the rig of a check, relative to those of a calibration."""
+
 OFFSET_pC = 10.0
 HYSTERESIS = 0.01
 LARGEST_FORCE_N = 1.6
@@ -78,6 +85,18 @@ def errors(answers: list[Contact], truth: np.ndarray) -> dict[str, float]:
 def model_errors(predictor: Predictor, truth: np.ndarray, charge: np.ndarray) -> dict[str, float]:
     """Return the errors of the contacts that a model computes from charges, shape (n, n_electrode), pC."""
     return errors([predictor.predict(row) for row in charge], truth)
+
+
+def rejected_share(problem: CalibrationProblem, predictor: Predictor, truth: np.ndarray, charge: np.ndarray) -> float:
+    """Return the share of the checks that reject a model, each with other presses and other errors of the rig."""
+    rng = np.random.default_rng(0)
+
+    def is_rejected() -> bool:
+        rows = rng.choice(len(truth), CHECKED_PRESSES, replace=False)
+        presses = measured_presses(problem, with_rig_errors(truth[rows], rng, CHECK_SCALE), charge[rows], CHECK_SCALE)
+        return check_presses(predictor, presses).fits is False
+
+    return float(np.mean([is_rejected() for _ in range(CHECKS)]))
 
 
 class Bench:
@@ -197,7 +216,8 @@ def film_results(bench: Bench, counts: list[int], *, has_all_cases: bool) -> dic
     truth, charge = bench.later(0.0)
     for count in counts:
         result, predictor = bench.calibrated(bench.contact[:count], bench.charge[:count])
-        results[f"{count} presses"] = model_errors(predictor, truth, charge)
+        rejected = rejected_share(bench.problem, predictor, truth, charge)
+        results[f"{count} presses"] = {**model_errors(predictor, truth, charge), "rejected": rejected}
     if not has_all_cases:
         return results
 

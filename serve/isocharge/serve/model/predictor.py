@@ -255,20 +255,20 @@ class Predictor:
         relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
         noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
 
-        contacts, effects = self._noise_effects(charge_pC, np.sqrt(extra_variance))
+        contacts, effects = self.noise_effects(charge_pC, np.sqrt(extra_variance))
         covariance = np.einsum("kni,knj->nij", effects, effects)  # sum over the electrodes (index k)
         misfit = (contacts[:, COLUMNS["misfit"]] / noise_ratio[:, np.newaxis]).astype(np.float32)
         return Contacts(*add_covariance(contacts, covariance).T)._replace(misfit=misfit[:, 0])
 
-    def _noise_effects(self, charge_pC: Singles, extra_std_pC: Array) -> tuple[Singles, Array]:
-        """Compute contacts, and the change of each contact by the additional noise of each charge.
+    def noise_effects(self, charge_pC: Array, noise_std_pC: Array) -> tuple[Singles, Array]:
+        """Compute contacts, and the change of each contact by the noise of each charge.
 
-        Each charge is raised and lowered by the standard deviation of its additional noise. Half of the difference
-        between the two contacts is the effect of the noise of this charge (central difference).
+        Each charge is raised and lowered by the standard deviation of its noise. Half of the difference between the two
+        contacts is the effect of the noise of this charge (central difference).
 
         Args:
-            charge_pC: Touch charges, shape (n, electrodes), pC.
-            extra_std_pC: Standard deviations of the additional noise, shape (n, electrodes), pC.
+            charge_pC: Touch charges, shape (n, electrodes), pC. They are not checked.
+            noise_std_pC: Standard deviations of the noise, shape (n, electrodes), pC.
 
         Returns:
             The ten numbers of each contact, shape (n, 10). Changes of x (mm), y (mm) and the force (N) by the noise of
@@ -277,7 +277,7 @@ class Predictor:
         # The step k changes only the charge k of every press. The axes are the step, the press and the charge.
         n_press, n_electrode = charge_pC.shape
         selection = np.eye(n_electrode)[:, np.newaxis]  # shape (electrodes, 1, electrodes)
-        steps = extra_std_pC * selection
+        steps = noise_std_pC * selection
         no_step = np.zeros_like(steps[:1])
 
         # All presses are predicted in one batch: first without a change, then with each charge raised, then lowered.

@@ -11,7 +11,7 @@ first appears as a common scale factor of all forces and as a common shift of al
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
 
@@ -33,7 +33,7 @@ from isocharge.serve.prediction.press_errors import (
     misfit_limit,
     press_errors,
 )
-from isocharge.serve.presses.measured_presses import PRESS_RULES, MeasuredPresses
+from isocharge.serve.presses.measured_presses import MeasuredPresses
 from isocharge.serve.presses.std_factor import FEWEST_HELD_OUT, StdFactor, binomial_distribution
 
 MIN_PRESSES = 3
@@ -44,6 +44,16 @@ MAX_BAD_FRACTION = 0.1
 
 MISFIT_FRACTION = 0.01
 """Largest fraction of good presses whose misfit is above `misfit_limit`."""
+
+RIG_REMEDY = (
+    "if the positions or forces of the rig may scatter by as much, state it: --position-std, --force-std, or columns "
+    "of the file, which take precedence"
+)
+FILM_REMEDY = (
+    "if the film has changed since its calibration, or was never calibrated, run `isocharge train calibrate`; if a "
+    "calibration does not help, train on at least 500 measured presses: `isocharge train fit PRESSES.csv`"
+)
+"""Notes about possible remedies for a model that does not fit."""
 
 
 @dataclass(frozen=True)
@@ -214,7 +224,9 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Collect the explanations for the user.
     notes: list[str] = []
     if fits is False:
-        notes += _remedies(errors, is_selected, position_mm, force_percent, misfit_text)
+        if not misfit_text:  # no error of the rig explains charges that fit no press
+            notes.append(RIG_REMEDY)
+        notes.append(FILM_REMEDY)
     notes += _exclusion_notes(errors, predictor.validity)
     if is_bad.any():
         notes.append(f"{errors.presses[is_bad].line_words}: nothing like the other presses, left out; look at it")
@@ -321,56 +333,6 @@ def _verdict(
     if misfit_text:
         return f"{verdict}; {misfit_text}"
     return verdict
-
-
-def _remedies(
-    errors: PressErrors,
-    is_selected: Booleans,
-    position: ErrorSummary | None,
-    force: ErrorSummary | None,
-    misfit_text: str,
-) -> Iterator[str]:
-    """Yield notes about possible remedies for a model that does not fit.
-
-    The first note states which standard deviations of the measured positions and forces would explain the errors. This
-    note is omitted if no standard deviations would explain the errors, for example if all positions are shifted
-    equally, or if the charges fit no press. The second note recommends a calibration, or training with the measured
-    presses.
-
-    Args:
-        errors: Errors of all presses.
-        is_selected: Whether each press is counted, shape (n,).
-        position: Errors of the positions; None if no position is known.
-        force: Errors of the forces; None if no force is known.
-        misfit_text: Statement that too many presses have a large misfit; empty if this is not the case.
-    """
-    # Attribute the part of the errors that nothing explains, `beyond`, to the rig.
-    larger_rig_std = np.full_like(errors.rig_std, np.nan)  # of x, y and the force
-    options = []
-    if position is not None:
-        distance_std = math.hypot(position.rig, position.beyond)
-        coordinate_std = distance_std / math.sqrt(2.0)  # x and y contribute equally to the distance
-        larger_rig_std[:, :FORCE] = coordinate_std
-        options.append(f"--position-std {coordinate_std:.2g}")
-    if force is not None:
-        force_std = 0.01 * math.hypot(force.rig, force.beyond)  # from percent
-        larger_rig_std[:, FORCE] = force_std
-        options.append(f"--force-std {force_std:.2g}")
-
-    # State the options only if the program accepts this standard deviation of the force, and if the larger standard
-    # deviations explain the errors.
-    is_possible = not PRESS_RULES["force_std"].violations(larger_rig_std[:, FORCE]).any()
-    is_explained = Agreement.from_errors(replace(errors, rig_std=larger_rig_std), is_selected).acceptable
-    if is_possible and is_explained and not misfit_text:
-        yield (
-            f"errors of the rig would explain the differences if it were as uncertain as {' '.join(options)}; standard "
-            "deviations in columns of the file take precedence over these options"
-        )
-
-    yield (
-        "if the film has changed since its calibration, or was never calibrated, run `isocharge train calibrate`; if a "
-        "calibration does not help, train on at least 500 measured presses: `isocharge train fit PRESSES.csv`"
-    )
 
 
 def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:

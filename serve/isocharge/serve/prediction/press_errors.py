@@ -1,9 +1,10 @@
 """Errors of a model on measured presses, and tests of whether noise and rig explain these errors.
 
 The rig is the machine that sets the position and the force of each press. The expected variance of an error is the sum
-of two variances. The first variance is caused by the noise of the charges, and is reported by the model. The second
-variance is caused by the uncertainty of the position or of the force that the rig sets. One statistical test uses the
-sum of the squared errors, and the other test uses the mean errors.
+of two variances. The first variance is caused by the noise of the charges and, for a calibrated model, by the uncertain
+properties of its film. The model reports this variance. The second variance is caused by the uncertainty of the
+position or of the force that the rig sets. One statistical test uses the sum of the squared errors, and the other test
+uses the mean errors. Both tests take into account that all presses share the error of the film.
 """
 
 import math
@@ -46,8 +47,11 @@ class PressErrors:
         predicted: Values of the attributes of `Contact` for each press, shape (n, 10); NaN if a charge is unknown.
         error: Predicted minus measured values of x (mm), y (mm) and the force (relative to the measured force), shape
             (n, 3). The error is NaN if the measured value is unknown.
-        noise_std: Standard deviations that the noise of the charges causes, as reported by the model, in the units of
-            `error`, shape (n, 3).
+        noise_std: Standard deviations that the noise of the charges and the uncertain film cause, as reported by the
+            model, in the units of `error`, shape (n, 3).
+        film_std: Standard deviations that the uncertain film alone causes, in the units of `error`, shape (n, 3). They
+            are a part of `noise_std`. All presses share the properties of the film, so these errors are not
+            independent.
         rig_std: Standard deviations of the measured values, in the units of `error`, shape (n, 3).
         flags: Flags of each press; empty if a charge is unknown.
         exclusion_reasons: Reason why each press is excluded from the comparison; empty for a press that is compared;
@@ -58,6 +62,7 @@ class PressErrors:
     predicted: Array
     error: Array
     noise_std: Array
+    film_std: Array
     rig_std: Array
     flags: tuple[tuple[str, ...], ...]
     exclusion_reasons: NDArray[np.str_]
@@ -77,6 +82,11 @@ class PressErrors:
         rig_variance = self.rig_std**2
         rig_variance[:, :FORCE] *= self.presses.same_place_count[:, np.newaxis]
         return self.noise_std**2 + rig_variance
+
+    @property
+    def shared_std(self) -> Array:
+        """Standard deviations of the part of the errors that is equal in all presses, shape (n, 3)."""
+        return np.hypot(self.film_std, COMMON_RATIO * self.rig_std)
 
     @property
     def chi_squared(self) -> Array:
@@ -144,9 +154,16 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     charge_pC = model_presses.charge_pC
     is_unknown_charge = np.isnan(charge_pC)
     is_complete = np.asarray(~is_unknown_charge.any(axis=1))
-    contacts = predictor.predict_batch(np.where(is_unknown_charge, 0.0, charge_pC))
+    known_charge_pC = np.where(is_unknown_charge, 0.0, charge_pC)
+    contacts = predictor.predict_batch(known_charge_pC)
     predicted = np.where(is_complete[:, np.newaxis], contacts, np.nan)
     flags_of_presses = predictor.validity.batch_flags(contacts)
+
+    # The uncertain film causes the part of the reported variance that the noise of the charges does not cause.
+    charge_std_pC = np.sqrt(predictor.noise.variance(known_charge_pC))
+    _, effects = predictor.noise_effects(known_charge_pC, charge_std_pC)  # by the noise of each charge
+    reported_std = predicted[:, COLUMNS["contact_std"]]
+    film_std = np.sqrt(np.maximum(reported_std**2 - (effects**2).sum(axis=0), 0.0))
 
     # Differences of x and y are errors in mm. Differences of the force are divided by the measured force.
     divisor = np.ones_like(measured)
@@ -160,7 +177,8 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
         presses=model_presses,
         predicted=predicted,
         error=(predicted[:, COLUMNS["contact"]] - measured) / divisor,
-        noise_std=np.where(is_unknown, np.nan, predicted[:, COLUMNS["contact_std"]] / divisor),
+        noise_std=np.where(is_unknown, np.nan, reported_std / divisor),
+        film_std=np.where(is_unknown, np.nan, film_std / divisor),
         rig_std=np.where(is_unknown, np.nan, rig_std),
         flags=tuple(flags if known else () for flags, known in zip(flags_of_presses, is_complete, strict=True)),
         exclusion_reasons=_exclusion_reasons(predictor.validity, model_presses),
@@ -226,6 +244,12 @@ COMMON_RATIO = 0.2
 For example, the positions of a stage may have a common offset, and the forces of a load cell a common scale error.
 """
 
+FILM_ERRORS = 3.0
+"""Number of independent errors to which the uncertain properties of a film contribute in a set of presses.
+
+These errors are mainly a common shift of x, a common shift of y, and a common scale of the forces.
+"""
+
 
 class CommonError(NamedTuple):
     """Estimates of the errors of x, y and the force that are common to all presses, such as a shift of all positions.
@@ -235,7 +259,7 @@ class CommonError(NamedTuple):
             known.
         std: Standard errors of the means, shape (3,). The standard errors are increased if the errors scatter more than
             noise and rig explain.
-        significance: Means divided by standard errors that include a constant error of the rig, shape (3,).
+        significance: Means divided by standard errors that include the constant errors of film and rig, shape (3,).
     """
 
     mean: Array
@@ -244,17 +268,17 @@ class CommonError(NamedTuple):
 
 
 @np.errstate(divide="ignore", invalid="ignore")
-def common_error(error: Array, variance: Array, rig_std: Array) -> CommonError:
+def common_error(error: Array, variance: Array, shared_std: Array) -> CommonError:
     """Estimate the errors that are common to all presses, such as a shift of all positions.
 
     The estimates are the means of the errors, weighted with the inverse of their expected variances. If the errors
     scatter more than their expected variances, the standard errors are increased. The significance is the ratio of a
-    mean to a standard error that also contains the part of the rig's error that is equal in all presses.
+    mean to a standard error that also contains the part of the errors that is equal in all presses.
 
     Args:
         error: Errors of x, y and the force, shape (n, 3); NaN where unknown.
         variance: Expected variance of each error, shape (n, 3).
-        rig_std: Part of the standard deviation of each error that the rig causes, shape (n, 3).
+        shared_std: Standard deviation of the part of each error that is equal in all presses, shape (n, 3).
     """
     # Weighted means of the known errors of x, y and the force, each of shape (3,)
     is_known = ~np.isnan(error)
@@ -267,9 +291,9 @@ def common_error(error: Array, variance: Array, rig_std: Array) -> CommonError:
     chi_squared_per_degree = chi_squared / np.maximum(is_known.sum(axis=0) - 1, 1)  # the mean uses one degree
     std = np.sqrt(np.maximum(chi_squared_per_degree, 1.0) / total_weight)
 
-    # Significance of the means in view of an error of the rig that is equal in all presses
-    common_rig_std = COMMON_RATIO * np.nansum(weight * rig_std, axis=0) / total_weight
-    significance = mean / np.hypot(std, common_rig_std)
+    # Significance of the means in view of the part of the errors that is equal in all presses
+    common_std = np.nansum(weight * shared_std, axis=0) / total_weight
+    significance = mean / np.hypot(std, common_std)
     return CommonError(mean, std, significance)
 
 
@@ -296,23 +320,30 @@ class Agreement:
         """Test whether noise and rig explain the errors of the selected presses.
 
         The statistic of the first test is the sum of `PressErrors.chi_squared`. The statistic of the second test is the
-        sum of the squared significances of the common errors. If noise and rig explain the errors, each statistic has
-        nearly a chi-squared distribution.
+        sum of the squared significances of the common errors. If noise, film and rig explain the errors, each statistic
+        has nearly a chi-squared distribution.
 
         Args:
             errors: Errors of all presses; NaN where a measured value is unknown.
             is_selected: Whether each press is selected, shape (n,).
         """
         error = errors.error[is_selected]
-        common = common_error(error, errors.variance[is_selected], errors.rig_std[is_selected])
+        common = common_error(error, errors.variance[is_selected], errors.shared_std[is_selected])
         chi_squared = float(errors.chi_squared[is_selected].sum())
         degrees = int(np.count_nonzero(~np.isnan(error)))
+
+        # The errors of the film are not independent, which increases the variance of the sum by this factor. Scaled
+        # down by the factor, the sum has the mean and the variance of a chi-squared variable with fewer degrees of
+        # freedom (Satterthwaite 1946).
+        film_share = errors.film_std**2 / errors.variance
+        film_sum = np.nansum(film_share[is_selected])  # part of the expected sum that the film causes
+        spread = 1.0 + film_sum**2 / (FILM_ERRORS * max(degrees, 1))
         common_chi_squared = np.nansum(common.significance**2)
         common_degrees = int(np.count_nonzero(~np.isnan(common.mean)))
         return cls(
             chi_squared=chi_squared,
             degrees=degrees,
-            p_value=chi_squared_survival(chi_squared, degrees),
+            p_value=chi_squared_survival(chi_squared / spread, degrees / spread),
             common=common,
             common_p_value=chi_squared_survival(common_chi_squared, common_degrees),
         )
@@ -349,7 +380,7 @@ def chi_squared_deviate(statistic: ArrayLike, degrees: ArrayLike) -> Array:
     return (cube_root - (1.0 - variance)) / np.sqrt(variance)
 
 
-def chi_squared_survival(statistic: float, degrees: int) -> float:
+def chi_squared_survival(statistic: float, degrees: float) -> float:
     """Compute the probability that a chi-squared variable exceeds a value.
 
     The error of the probability is below 0.05 for one degree of freedom, and below 0.013 for more degrees. For
