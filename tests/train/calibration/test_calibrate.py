@@ -194,7 +194,7 @@ def test_one_press_states_nothing_about_the_noise(fit, press_film):
 @pytest.mark.parametrize("is_exact", [True, False])
 def test_uneven_film_whose_solution_changes_the_estimate_again_is_a_caution(fit, press_film, monkeypatch, is_exact):
     monkeypatch.setattr(SyntheticFilm, "solved", lambda film, *_: film, raising=False)
-    monkeypatch.setattr(calibrate_module, "_is_exact", lambda *_: is_exact)
+    monkeypatch.setattr(calibrate_module, "_has_accurate_charges", lambda *_: is_exact)
     presses = press_film(12, seed=11)
     cautions = fit(presses, accurate=True).cautions
     assert cautions == (() if is_exact else (calibrate_module.NOT_CONVERGED,))

@@ -82,6 +82,7 @@ def calibrate(
         PressError: If the records of the presses are impossible, if no film explains the presses, or if the electrodes
             would be too far from their described places. The message names the reason if it is found.
     """
+    # Check the recorded presses, and select those that are used.
     recorded_presses = presses.of_electrodes(problem.electrodes, problem.sensor.name)
     check_places(recorded_presses, problem.sensor.film)
     cautions = []
@@ -89,30 +90,34 @@ def calibrate(
     is_copy = have_charges_of_earlier(recorded_presses.charge_pC)
     if is_copy.any():
         cautions.append(f"{recorded_presses[is_copy].line_words}: the charges of an earlier press; left out")
-    ordered_presses = recorded_presses[~is_copy]
-    if _is_uninformative(ordered_presses):
+    distinct_presses = recorded_presses[~is_copy]
+    if _is_uninformative(distinct_presses):
         raise PressError(
-            f"{len(ordered_presses)} presses of unknown position and force: three charges only determine x, y and the "
+            f"{len(distinct_presses)} presses of unknown position and force: three charges only determine x, y and the "
             "force, so they say nothing about the film; give the position or the force of a press (four electrodes "
             "would have one redundant charge)"
         )
     # The solved domain is larger than the working area, because errors may move presses at its edge to the outside.
-    is_outside = problem.solved_domain.is_outside(ordered_presses.contact)
-    used_presses = ordered_presses[~is_outside]
-    outside_words = (
-        f"{ordered_presses[is_outside].line_words}: a calibration takes presses {domain_words(problem.solved_domain)} "
+    is_outside = problem.solved_domain.is_outside(distinct_presses.contact)
+    used_presses = distinct_presses[~is_outside]
+    outside_message = (
+        f"{distinct_presses[is_outside].line_words}: a calibration takes presses {domain_words(problem.solved_domain)} "
         "(--radius, --force)"
     )
     if is_outside.any():
-        if len(ordered_presses) == 1 or _is_uninformative(used_presses):
-            raise PressError(outside_words)
-        cautions.append(f"{outside_words}; left out")
+        if len(distinct_presses) == 1 or _is_uninformative(used_presses):
+            raise PressError(outside_message)
+        cautions.append(f"{outside_message}; left out")
+
+    # Estimate the film.
     with single_threaded_blas():
-        charges = start or solve_even(problem, executor)
+        start_film = start or solve_even(problem, executor)
         if is_outside.mean() > 0.5:
-            raise unexplained_error(ordered_presses, charges, outside_words)
-        estimation = _fit_film(problem, used_presses, charges, accurate, executor)
-        if accurate and not _is_exact(estimation.charges, estimation.film.film_values, estimation.contact):
+            # The records probably contain a mistake, such as a wrong unit, for which `unexplained_error` searches.
+            raise unexplained_error(distinct_presses, start_film, outside_message)
+        estimation = _fit_film(problem, used_presses, start_film, accurate, executor)
+        # The last solved film must be so similar to the final estimate that the charges of the estimate are accurate.
+        if accurate and not _has_accurate_charges(estimation.charges, estimation.film.film_values, estimation.contact):
             cautions.append(NOT_CONVERGED)
         _check_placement(estimation.film)
         sensitivity = ContactSensitivity.of(estimation.film, estimation.charges, problem.domain)
@@ -147,30 +152,33 @@ def _fit_film(
     problem: CalibrationProblem,
     presses: MeasuredPresses,
     charges: FilmCharges,
-    accurate: bool,
+    solve_uneven: bool,
     executor: Executor | None,
 ) -> Estimation:
-    """Estimate a film from presses, of which most are in the solved domain.
+    """Estimate a film from presses in the solved domain.
 
-    Axisymmetric films are solved and the properties are estimated in turn, until the estimate hardly changes. The
-    estimated film is then solved with its imperfections and its real probe, and the properties are estimated again.
-    These two steps are repeated once if the estimate has changed the film much. A nearly even film under an
-    axisymmetric probe does not need them.
+    An even film has no imperfections, so it is axisymmetric and quickly solved. In the first stage, even films are
+    solved and the properties are estimated in turn, until the estimate hardly changes. In the second stage, the
+    estimated film is solved with its imperfections and its real probe, and the properties are estimated again. If the
+    film then differs much from the solved one, the second stage is repeated once. The second stage is left out for a
+    nearly even film under an axisymmetric probe.
 
     Args:
         problem: The calibration problem.
         presses: The presses, with the electrodes in the order of the sensor.
         charges: Charges of the film that is used first, and of similar films.
-        accurate: Whether an uneven film is solved.
+        solve_uneven: Whether the second stage may take place.
         executor: Executor that runs the solves; None for this process.
 
     Raises:
         PressError: If the presses probably contain a mistake, or no film explains them.
     """
+    # Refuse presses whose records contain a mistake. `find_mistakes` returns an empty list if it finds none.
     check_channels(presses, charges)
     if misfit(presses, charges) > SUSPICIOUS_MISFIT and find_mistakes(presses, charges):
         raise unexplained_error(presses, charges, "their charges are very different from those of its films")
 
+    # First stage: even films. The given film is used first.
     data = PressData.of(presses, problem.noise, problem.solved_domain)
     estimation = estimate(charges, data, problem.prior)
     for _ in range(MAX_SOLVED_FILMS - 1):
@@ -179,19 +187,21 @@ def _fit_film(
         charges = solve_even(problem, executor, estimation.film.film_values)
         estimation = estimate(charges, data, problem.prior, estimation)
 
-    is_at_bound = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)
+    # Search for mistakes again if the estimate assumes larger errors than stated, or has a property at a bound.
+    is_at_bound = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)  # (lower, upper)
     is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_bound.any()
     if is_doubtful and find_mistakes(presses, charges):
         raise unexplained_error(
             presses, charges, "only larger errors of the positions or an improbable film would explain them"
         )
 
-    # The axisymmetric film contains the unevenness as a first-order change, which is enough to refuse presses that no
-    # film explains, before the long solution of the uneven film. The effect of another probe is unknown here.
-    is_final = not accurate or (estimation.is_unexplained and problem.probe.is_axisymmetric)
+    # Second stage: the film with its imperfections. Its solution takes long. It would not help presses that no film
+    # explains, because the first stage already contains the first-order effects of the imperfections. It may help if
+    # the probe is not axisymmetric, because the first stage replaces the probe by a circle.
+    is_final = not solve_uneven or (estimation.is_unexplained and problem.probe.is_axisymmetric)
     for _ in range(2):
         values = estimation.film.film_values
-        if is_final or _is_exact(estimation.charges, values, estimation.contact):
+        if is_final or _has_accurate_charges(estimation.charges, values, estimation.contact):
             break
         estimation = estimate(estimation.charges.solved(values, executor), data, problem.prior, estimation)
     if estimation.is_unexplained:
@@ -216,19 +226,16 @@ def _largest_deviation(estimation: Estimation) -> float:
     return float(np.abs((film.film_values - charges.values) / std)[is_even].max())
 
 
-def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
+def _has_accurate_charges(charges: FilmCharges, film_values: Array, contact: Array) -> bool:
     """Return whether first-order changes of a solved film give the charges of a film with given properties accurately.
 
     The solved film may lack some imperfections. Of these imperfections, only first-order effects on the charges are
-    known. First-order effects are accurate enough if the second-order effects are small. A second-order effect is about
-    the square of the first-order effect. An uneven tension has a further second-order effect, even if its first-order
-    effect is small. If u is the ratio of the uneven to the mean tension T, the film behaves as if the mean tension were
-    smaller by up to T u^2 / 2. If the solved probe or the solved material lacks a property, even the first-order effect
-    of this property is unknown.
+    known. First-order effects are accurate enough if the second-order effects are below `MAX_NEGLECTED_EFFECT`. If the
+    solved probe or the solved material lacks a property, even the first-order effect of this property is unknown.
 
     Args:
         charges: The solved film, with its charges and their derivatives.
-        values: The given properties, shape (n_property,).
+        film_values: The given properties, shape (n_property,).
         contact: Contacts at which the effects are computed, shape (n, 3).
     """
     solved, prior = charges.film, charges.prior
@@ -239,17 +246,19 @@ def _is_exact(charges: FilmCharges, values: Array, contact: Array) -> bool:
 
     # Compute the first-order effect of the imperfections that the solved film lacks, relative to the charges. Only
     # imperfections that change the stress can be missing. The effects of all other imperfections are exact.
-    charge, _, jacobian = charges.linearised(values, contact)
+    charge, _, jacobian = charges.linearised(film_values, contact)
     charge_size = np.linalg.norm(charge)
     can_be_missing = prior.is_imperfection & prior.changes_stress
-    missing = np.where(can_be_missing, values - charges.values, 0.0)  # missing part of each property
+    missing = np.where(can_be_missing, film_values - charges.values, 0.0)  # missing part of each property
     first_order_effect = np.linalg.norm(jacobian @ missing) / charge_size
 
-    # Compute the further effect of an uneven tension, which acts like a decrease of the mean tension T by T u^2 / 2.
+    # An uneven tension also has a second-order effect of its own, even if its first-order effect is small. If u is the
+    # ratio of the uneven tension to the mean tension T, the film behaves as if T were smaller by up to T u^2 / 2.
     tension_index = prior.index(PRETENSION.name)
-    missing_tensions = missing[np.isin(prior.names, UNEVEN_TENSIONS)]  # components of u
-    lost_tension_MPa = 0.5 * values[tension_index] * (missing_tensions**2).sum()
+    missing_shares = missing[np.isin(prior.names, UNEVEN_TENSIONS)]  # the two components of u
+    lost_tension_MPa = 0.5 * film_values[tension_index] * (missing_shares**2).sum()
     tension_effect = lost_tension_MPa * np.linalg.norm(jacobian[:, :, tension_index]) / charge_size
+    # All other second-order effects together are about the square of the first-order effect.
     return bool(first_order_effect**2 + tension_effect < MAX_NEGLECTED_EFFECT)
 
 
@@ -280,18 +289,22 @@ def _check_placement(film: FilmEstimate) -> None:
 
 
 def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
-    """Return warnings about presses, the session, and a film that differs much from its description."""
+    """Return warnings about presses, the session, and a film that differs much from its description.
+
+    The estimator has compared several hypotheses about the errors of the presses. Some warnings state the errors of the
+    most probable hypothesis, which may be larger than the user has stated.
+    """
     cautions = []
-    film = estimation.film
+    film = estimation.film  # its noise is an average over the hypotheses
     if estimation.is_bad.any():
         cautions.append(f"{presses[estimation.is_bad].line_words}: does not agree with the other presses; left out")
-    if estimation.is_improbable:
+    if estimation.is_improbable:  # the residuals are too large for the most probable hypothesis
         cautions.append(
             f"the presses differ from the best film by {estimation.residual:.2g} times their errors, so the model may "
             "err by as many times more than it states: make the presses again, or state larger errors (--charge-std, "
             "--position-std, --force-std)"
         )
-    errors = estimation.hypothesis.errors
+    errors = estimation.hypothesis.errors  # a further scatter is zero if the stated errors are large enough
     if errors.noise.gain > MAX_USUAL_NOISE:
         cautions.append(
             f"the charges scatter by about {100.0 * film.noise.gain:.2g} %, which the standard deviations of the model "
@@ -303,7 +316,7 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
             f"the positions scatter about {errors.position_ratio:.0f} times as much as stated (--position-std): are "
             "they measured from the centre of the film, and does the probe touch it where the stage says?"
         )
-    if errors.force_scatter + errors.constant_force_scatter > 0.0:
+    if errors.force_scatter + errors.constant_force_scatter > 0.0:  # none of them is negative
         cautions.append(
             f"the forces scatter more than stated, by about {100.0 * errors.force_scatter:.2g} % of each force and "
             f"{100.0 * errors.constant_force_scatter:.2g} % of their geometric mean: is the load cell zero "
@@ -311,7 +324,7 @@ def _cautions(presses: MeasuredPresses, estimation: Estimation) -> list[str]:
             "standard deviations of the model do not contain errors that many forces share"
         )
     cautions.extend(film.session_cautions())
-    for declared in film.layout.prior.properties:
+    for declared in film.layout.prior.properties:  # the declaration states the prior distribution of a property
         value = film.value(declared.name)
         is_unusual = abs(value - declared.mean) > UNUSUAL_DEVIATION * declared.std
         if is_unusual and not declared.is_imperfection:

@@ -49,7 +49,8 @@ class FilmCharges:
     def of_even_film(cls, prior: FilmPrior, values: Array, domain: Domain, executor: Executor | None) -> "FilmCharges":
         """Solve a film without its imperfections, and return its charges and their derivatives.
 
-        The film and the probe are axisymmetric, so that few presses need to be solved. The method `solved` later
+        A film without imperfections is called even. The film is axisymmetric, and so is the probe: a probe that is not
+        axisymmetric is replaced by a circle. Only a few presses therefore need to be solved. The method `solved` later
         replaces the charges by those of the film with its imperfections, but keeps these derivatives.
 
         Args:
@@ -63,10 +64,14 @@ class FilmCharges:
             SolveError: If a press has no equilibrium.
         """
         even_values = prior.without_imperfections(values)
-        sensor, probe = prior.film(even_values)
-        # The even values do not cancel a shear modulus of the sensor file. Make the film exactly axisymmetric.
-        film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
-        slopes = FilmSlopes.build(replace(sensor, film=film), round_probe(probe), domain, executor=executor)
+        sensor, probe = prior.film(even_values)  # the sensor and the probe with these properties
+        # The values may not cancel the described imperfections exactly. They do not change a shear modulus that the
+        # sensor file states. Remove both, so that the film is exactly axisymmetric.
+        axisymmetric_film = replace(sensor.film, deviator=(0.0, 0.0), young_ratio=1.0, shear=None, oval=0.0)
+        slopes = FilmSlopes.build(
+            replace(sensor, film=axisymmetric_film), round_probe(probe), domain, executor=executor
+        )
+        # `slopes.film` is the forward map of the solved film, from contacts to charges.
         return cls(prior=prior, values=even_values, film=slopes.film, slopes=slopes, even_values=even_values)
 
     @property
@@ -75,10 +80,11 @@ class FilmCharges:
         return replace(self, values=self.even_values, film=self.slopes.film)
 
     def solved(self, values: Array, executor: Executor | None) -> "FilmCharges":
-        """Solve a similar film under the probe itself, even if the probe is not circular, and return its charges.
+        """Return the charges of a similar film, which is solved with its imperfections and under its real probe.
 
-        The interpolation of the new forward map is checked. The derivatives with respect to the properties are not
-        computed again. They remain the derivatives of this film.
+        The present charges may belong to a circular probe in place of the real probe. The forward map from contacts to
+        charges is built again, and its interpolation is checked. The derivatives with respect to the properties are not
+        computed again. They remain the present derivatives.
 
         Args:
             values: Properties of the film, shape (n_property,).
@@ -92,8 +98,8 @@ class FilmCharges:
         middle_force = float(np.sqrt(np.prod(force_range)))
         resolution = needed_resolution(sensor.film, probe, nearest_to_clamp(sensor.film, radius), middle_force)
         settings = SolveSettings(resolution=resolution)
-        film = ForwardMap.build(sensor, probe, radius, force_range, settings, executor=executor)
-        return replace(self, values=values, film=film)
+        forward_map = ForwardMap.build(sensor, probe, radius, force_range, settings, executor=executor)
+        return replace(self, values=values, film=forward_map)
 
     @property
     def domain(self) -> Domain:
@@ -111,7 +117,7 @@ class FilmCharges:
             Charges, shape (n, n_electrode), pC.
         """
         solved_charge, _, derivatives = self._solved_charges(self._sensor_with_readout(values), contact)
-        charge, _ = _add_stress_changes(solved_charge, self._property_changes(values), derivatives)
+        charge, _ = _with_stress_changes(solved_charge, self._property_changes(values), derivatives)
         return charge
 
     def linearised(self, values: Array, contact: Array) -> ModelValues:
@@ -127,8 +133,10 @@ class FilmCharges:
             those of the solved film.
         """
         sensor = self._sensor_with_readout(values)
+        # `derivatives` contains an array of shape (n, n_electrode) for each property, by the name of the property: at
+        # first for the properties that change the stress.
         solved_charge, contact_slopes, derivatives = self._solved_charges(sensor, contact)
-        charge, factor = _add_stress_changes(solved_charge, self._property_changes(values), derivatives)
+        charge, derivative_factor = _with_stress_changes(solved_charge, self._property_changes(values), derivatives)
 
         # The derivatives D so far are taken with respect to the uneven parts of the pretension in MPa. The values
         # contain each part as a share s of the pretension T, so the part is s T. By the chain rule, the derivative with
@@ -144,14 +152,14 @@ class FilmCharges:
         for name, is_own in zip(sensor.electrode_names, np.eye(len(sensor.electrodes)), strict=True):
             derivatives[f"gain {name}"] = is_own * solved_charge
         # The derivatives with respect to the other properties of the readout are difference quotients.
-        for declared in self.prior.properties:
-            if declared.name not in derivatives:
-                derivatives[declared.name] = self._readout_derivative(sensor, declared, contact)
+        for film_property in self.prior.properties:
+            if film_property.name not in derivatives:
+                derivatives[film_property.name] = self._readout_derivative(sensor, film_property, contact)
 
-        # So far, the derivatives belong to the charges of the solved film. The factor adapts them to the changed
-        # charges.
+        # So far, the derivatives belong to the charges of the solved film. The factor, shape (n, n_electrode), adapts
+        # them to the changed charges.
         columns = np.stack([derivatives[name] for name in self.prior.names], axis=2)  # (n, n_electrode, n_property)
-        return ModelValues(charge, contact_slopes, factor[:, :, None] * columns)
+        return ModelValues(charge, contact_slopes, derivative_factor[:, :, None] * columns)
 
     def _sensor_with_readout(self, values: Array) -> Sensor:
         """Return the solved sensor with the electrodes and the piezoelectric coefficients of given properties.
@@ -162,7 +170,7 @@ class FilmCharges:
         sensor, _ = self.prior.film(np.where(self.prior.changes_stress, self.values, values))
         return sensor
 
-    def _mechanics(self, values: Array) -> dict[str, float]:
+    def _values_by_name(self, values: Array) -> dict[str, float]:
         """Return the properties by name, with the uneven parts of the pretension in MPa instead of as shares.
 
         Args:
@@ -174,21 +182,20 @@ class FilmCharges:
         return value_of
 
     def _property_changes(self, values: Array) -> dict[str, float]:
-        """Return the differences between given properties and those of the solved film, by name; see `_mechanics`."""
-        solved, changed = self._mechanics(self.values), self._mechanics(values)
+        """Return the differences between given properties and those of the solved film; see `_values_by_name`."""
+        solved, changed = self._values_by_name(self.values), self._values_by_name(values)
         return {name: changed[name] - solved[name] for name in changed}
 
     def _solved_charges(self, sensor: Sensor, contact: Array) -> tuple[Array, Array, dict[str, Array]]:
         """Compute charges of the solved film, and their derivatives with respect to properties that change the stress.
 
-        The values of the properties "young" and "thickness" are the logarithms of Young's modulus E and of the
-        thickness h. The derivatives with respect to these logarithms follow from the other derivatives. The reason is
-        that the stress divided by E only depends on F / (E h), where F is the force, and on the tensions divided by E.
-        Two small effects are neglected here: the bending, and the effect of the radius of the probe on the charges of
+        The derivatives with respect to Young's modulus and to the thickness follow from the other derivatives, if the
+        bending is neglected. The derivatives with respect to the other properties are those of the axisymmetric film of
+        `self.slopes`. The derivative with respect to the radius of the probe lacks the small effect on the charges of
         the contact pressure (d33).
 
         Args:
-            sensor: Sensor with the electrodes and the coefficients.
+            sensor: Sensor with the electrodes and the piezoelectric coefficients that are used.
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
@@ -196,24 +203,26 @@ class FilmCharges:
             n_electrode, 3); and their derivatives with respect to properties, by the name of the property, each of
             shape (n, n_electrode), pC per unit. The unit of the uneven parts of the pretension is MPa.
         """
-        solved_charge, contact_slopes = _read(self.film, sensor).linearised(contact)
-        force_slope = contact_slopes[:, :, 2]
+        solved_charge, contact_slopes = _with_readout(self.film, sensor).linearised(contact)
+        force_slope = contact_slopes[:, :, 2]  # with respect to ln F
 
-        # Use the solved stresses with the electrodes and the coefficients of the given sensor.
+        # The two maps of `self.slopes` contain the solved stress of the axisymmetric film, and its changes with the
+        # properties. Use them with the electrodes and the coefficients of the given sensor.
         slopes_of_sensor = replace(
-            self.slopes, film=_read(self.slopes.film, sensor), fields=_read(self.slopes.fields, sensor)
+            self.slopes, film=_with_readout(self.slopes.film, sensor), fields=_with_readout(self.slopes.fields, sensor)
         )
         slopes = slopes_of_sensor.jacobian(contact)
         # The radius of the probe is only a property if the probe is a circle.
         derivatives = {name: slope for name, slope in slopes.items() if name in self.prior.names}
 
-        # A charge is proportional to the stress: Q = E q, where q is a function of F / (E h) and of the tensions T / E.
-        # An increase of ln h has the same effect on q as a decrease of ln F, so that dQ/d(ln h) = -dQ/d(ln F). An
-        # increase of ln E also has the effect of a decrease of ln F and of each ln T, and increases the factor E. So
-        # dQ/d(ln E) = Q - dQ/d(ln F) - sum of dQ/d(ln T), where dQ/d(ln T) = T dQ/dT.
+        # The values of "young" and "thickness" are ln E and ln h, with Young's modulus E and the thickness h. A charge
+        # is Q = E q, where q depends only on F / (E h), with the force F, and on each tension T divided by E. An
+        # increase of ln h has the same effect on q as a decrease of ln F, so that dQ/d(ln h) = -dQ/d(ln F). An increase
+        # of ln E changes q like a decrease of ln F and a decrease of all tensions T by the same ratio. It also
+        # increases the factor E. So dQ/d(ln E) = Q - dQ/d(ln F) - sum of T dQ/dT over the three tensions in MPa.
         derivatives["thickness"] = -force_slope
-        mechanics = self._mechanics(self.values)
-        tension_terms = (mechanics[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
+        value_of = self._values_by_name(self.values)
+        tension_terms = (value_of[name] * derivatives[name] for name in (PRETENSION.name, *UNEVEN_TENSIONS))
         derivatives["young"] = solved_charge - force_slope - sum(tension_terms)
         return solved_charge, contact_slopes, derivatives
 
@@ -230,11 +239,11 @@ class FilmCharges:
         """
         step = DIFFERENCE_STEP * film_property.std
         sensors = [changed_film(sensor, self.film.probe, {film_property.name: change})[0] for change in (step, -step)]
-        forward, backward = (_read(self.film, changed).charges(contact) for changed in sensors)
+        forward, backward = (_with_readout(self.film, changed).charges(contact) for changed in sensors)
         return (forward - backward) / (2.0 * step)
 
 
-def _add_stress_changes(
+def _with_stress_changes(
     solved_charge: Array, changes: dict[str, float], derivatives: dict[str, Array]
 ) -> tuple[Array, Array]:
     """Apply first-order changes of the properties to the charges of a solved film, and return the changed charges.
@@ -251,8 +260,8 @@ def _add_stress_changes(
             stress, by their names, each of shape (n, n_electrode), pC per unit.
 
     Returns:
-        Charges, shape (n, n_electrode), pC, and factors of the same shape, by which the derivatives of the solved
-        charges must be multiplied.
+        Charges, shape (n, n_electrode), pC, and factors of the same shape. A derivative of a solved charge, multiplied
+        by its factor, is the derivative of the changed charge.
     """
     addition = np.zeros_like(solved_charge)
     for name, derivative in derivatives.items():
@@ -271,6 +280,6 @@ def round_probe(probe: Probe) -> Probe:
     return probe if probe.is_axisymmetric else Circle(float(np.sqrt(probe.area / np.pi)))
 
 
-def _read(forward_map: ForwardMap, sensor: Sensor) -> ForwardMap:
+def _with_readout(forward_map: ForwardMap, sensor: Sensor) -> ForwardMap:
     """Return the forward map of a solved film with the electrodes and the piezoelectric coefficients of a sensor."""
     return replace(forward_map, sensor=replace(sensor, film=forward_map.sensor.film))

@@ -37,7 +37,8 @@ FADING = 0.5
 def terms(contact: Array, domain: Domain) -> Array:
     """Compute the terms of the discrepancy, which are products of Chebyshev polynomials.
 
-    The polynomials in x, y and ln F have the degrees i, j and m. Each term is multiplied by FADING^(i + j + m).
+    The polynomials in x, y and ln F have the degrees i, j and m. Each term is multiplied by FADING^(i + j + m), so that
+    terms of high degrees, which change quickly with the contact, have small effects.
 
     Args:
         contact: Contacts (x, y, F) within the domain, shape (n, 3), mm and N.
@@ -46,12 +47,13 @@ def terms(contact: Array, domain: Domain) -> Array:
     Returns:
         Values of the terms, shape (n, n_term), dimensionless.
     """
-    i, j, m = _degrees().T
+    i, j, m = _term_degrees().T  # each of shape (n_term,)
     x, y, log_force = domain.to_unit(contact).T
     all_products = chebyshev.chebvander3d(x, y, log_force, (DEGREE, DEGREE, FORCE_DEGREE))
-    product_of_degrees = all_products.reshape(-1, DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)
+    # The axes are the contact and the three degrees.
+    product_by_degrees = all_products.reshape(-1, DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)
     factor = FADING ** (i + j + m)  # of each term, shape (n_term,)
-    return np.asarray(factor * product_of_degrees[:, i, j, m])
+    return np.asarray(factor * product_by_degrees[:, i, j, m])
 
 
 def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array:
@@ -75,7 +77,7 @@ def discrepancy_jacobian(charge: Array, contact: Array, domain: Domain) -> Array
 
 
 @cache
-def _degrees() -> Integers:
+def _term_degrees() -> Integers:
     """Return the degrees of each term as a polynomial in x, y and ln F, shape (n_term, 3)."""
     all_degrees = np.indices((DEGREE + 1, DEGREE + 1, FORCE_DEGREE + 1)).reshape(3, -1).T
     return np.asarray(all_degrees[all_degrees.sum(axis=1) <= DEGREE])
@@ -92,7 +94,7 @@ def unit_covariance(n_electrode: int) -> Array:
     """
     # A coefficient is the sum of a part of its own and a part that is the same for all electrodes, both of variance 1.
     between_electrodes = np.eye(n_electrode) + np.ones((n_electrode, n_electrode))
-    return np.asarray(np.kron(np.eye(len(_degrees())), between_electrodes), dtype=float)
+    return np.asarray(np.kron(np.eye(len(_term_degrees())), between_electrodes), dtype=float)
 
 
 COEFFICIENT_DRIFT = 0.002
@@ -159,12 +161,18 @@ class Layout:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of all unknowns."""
+        """Names of all unknowns, in the order of their values in a vector.
+
+        The order is: properties of the film, offsets of the electrodes, other unknowns of the session, coefficients of
+        the discrepancy. The name of a coefficient contains the degrees of its term in x, y and ln F, such as "110".
+        """
         electrodes = self.prior.sensor.electrode_names
-        degrees_of_terms = ["".join(map(str, degrees)) for degrees in _degrees().tolist()]  # of x, y and ln F
-        coefficients = [f"discrepancy {term} {name}" for term in degrees_of_terms for name in electrodes]
+        degree_texts = ["".join(map(str, degrees)) for degrees in _term_degrees().tolist()]
+        coefficients = [f"discrepancy {degree_text} {name}" for degree_text in degree_texts for name in electrodes]
+        # The first entry of `SESSION` declares the offsets, of which each electrode has one. The other entries declare
+        # one unknown each.
         offsets = [f"offset {name}" for name in electrodes]
-        return (*self.prior.names, *offsets, *(one.name for one in SESSION[1:]), *coefficients)
+        return (*self.prior.names, *offsets, *(declared.name for declared in SESSION[1:]), *coefficients)
 
     @property
     def film(self) -> slice:
@@ -222,7 +230,8 @@ class FilmEstimate:
         The covariance is increased, because the film may have drifted since this session. A drift of the pretension
         comes from a change of the temperature, which adds the same tension in all directions. The estimate contains the
         uneven parts of the tension as shares of the mean tension. The uneven parts do not drift, so the drift of the
-        mean tension changes their shares. The offset and the other unknowns of this session are removed.
+        mean tension changes their shares. The unknowns of this session, such as the offsets, become zero with the
+        variance zero.
         """
         layout = self.layout
         drift_std = np.zeros(len(self.values))
@@ -232,12 +241,14 @@ class FilmEstimate:
         drift_effects = np.diag(drift_std)
         tension_index = layout.index(PRETENSION.name)
         for name in UNEVEN_TENSIONS:
-            # The limit avoids a very large change for a film that is nearly slack.
+            # A share s = t / T of the constant uneven part t changes by -s / T per MPa of the mean tension T. The lower
+            # limit of T avoids a very large change for a film that is nearly slack.
             share_change_per_MPa = -self.value(name) / max(self.values[tension_index], PRETENSION.drift)
             drift_effects[layout.index(name), tension_index] = share_change_per_MPa * PRETENSION.drift
         covariance = self.covariance + drift_effects @ drift_effects.T
 
-        # Remove the unknowns of this session: their values, and their rows and columns of the covariance.
+        # Set the unknowns of this session to zero: their values, and their rows and columns of the covariance. In the
+        # order of the unknowns, they lie between the properties of the film and the coefficients of the discrepancy.
         session = slice(layout.film.stop, layout.coefficients.start)
         values = self.values.copy()
         values[session] = 0.0
@@ -248,21 +259,23 @@ class FilmEstimate:
     def session_cautions(self) -> list[str]:
         """Return sentences about session unknowns that differ from zero by more than three standard deviations."""
         cautions = []
-        for one in SESSION:
-            certain_values = [
+        for session_property in SESSION:
+            # The property `offset` has one unknown for each electrode, with a name such as "offset A". Any other
+            # property has one unknown with the name of the property.
+            significant_values = [
                 f"{self.value(name):.3g} +- {self.std(name):.2g} ({name})"
                 for name in self.layout.names
-                if name.startswith(one.name) and abs(self.value(name)) > 3.0 * self.std(name)
+                if name.startswith(session_property.name) and abs(self.value(name)) > 3.0 * self.std(name)
             ]
-            if certain_values:
-                cautions.append(one.caution.format(values=", ".join(certain_values)))
+            if significant_values:
+                cautions.append(session_property.caution.format(values=", ".join(significant_values)))
         return cautions
 
 
 REMAINING_DISCREPANCY = 0.3
 """Size of the part of the discrepancy that an earlier calibration could not show, relative to the hypothesis."""
 
-PLANNING_SIZES = np.array([1.0, 0.5, 0.5, 0.01, *(one.stds[0][0] for one in SESSION)])
+PLANNING_SIZES = np.array([1.0, 0.5, 0.5, 0.01, *(session_property.stds[0][0] for session_property in SESSION)])
 """Sizes of the parts of the prior covariance that are assumed to plan presses before the first press."""
 
 
@@ -281,10 +294,14 @@ class Prior:
 
     @property
     def mean(self) -> Array:
-        """Means of the unknowns, shape (n_unknown,)."""
+        """Means of the unknowns, shape (n_unknown,).
+
+        After an earlier calibration, the means are the values of its estimate. Otherwise, they are the declared means
+        of the properties of the film, and zero for all other unknowns.
+        """
         if self.earlier is not None:
             return self.earlier.values
-        mean = np.zeros(self.layout.coefficients.stop)
+        mean = np.zeros(self.layout.coefficients.stop)  # the coefficients are the last unknowns
         mean[self.layout.film] = self.layout.prior.mean
         return mean
 
@@ -301,24 +318,27 @@ class Prior:
         """Matrices whose weighted sum is the covariance of the unknowns, shape (4 + n_session, n_unknown, n_unknown).
 
         The first part is the covariance that is the same under all hypotheses. The other parts are the covariances of
-        the uneven tension, of the other imperfections, of the discrepancy, and of each entry of `SESSION`, all of the
-        size 1. A hypothesis multiplies each of these parts by the square of a size; see `Hypothesis.sizes`.
+        the uneven tension, of the other imperfections, of the discrepancy, and of each entry of `SESSION`, as they are
+        if their sizes are 1. A hypothesis multiplies each of these parts by the square of a size; see
+        `Hypothesis.sizes`. The first entry of `SESSION` declares the offsets of the electrodes. Each other entry
+        declares one unknown.
 
         After an earlier calibration, the first part is the covariance of the earlier estimate, which includes the
         imperfections. The parts of the imperfections are then zero, and the part of the discrepancy describes only what
         the earlier calibration could not show.
         """
         layout = self.layout
-        n_unknown = layout.coefficients.stop
+        n_unknown = layout.coefficients.stop  # the coefficients are the last unknowns
         parts = np.zeros((4 + len(SESSION), n_unknown, n_unknown))
         # These matrices are views of `parts`. They are filled below, one after the other.
-        fixed, uneven_tension, other_imperfections, discrepancy, offset, *others = parts
+        fixed, uneven_tension, other_imperfections, discrepancy, offset, *other_session_parts = parts
         n_electrode = len(layout.prior.sensor.electrode_names)
         coefficient_covariance = unit_covariance(n_electrode)
         discrepancy[layout.coefficients, layout.coefficients] = coefficient_covariance
         # An offset, like a coefficient, is the sum of a part of its own and a part that is the same for all electrodes.
         offset[layout.offset, layout.offset] = coefficient_covariance[:n_electrode, :n_electrode]
-        for index, part in enumerate(others, layout.offset.stop):  # index of an unknown of the session, and its part
+        # The other unknowns of the session follow the offsets, in the order of their parts.
+        for index, part in enumerate(other_session_parts, layout.offset.stop):
             part[index, index] = 1.0
         if self.earlier is not None:
             fixed += self.earlier.covariance

@@ -67,6 +67,8 @@ class PressData:
             domain: Domain of the possible contacts.
         """
         # Replace unknown values by finite numbers. Their standard deviations are infinite, so they do not count.
+        # Presses at one place share one error of the position. The estimator treats the errors as independent, so the
+        # variance of each position is multiplied by the number of presses at its place.
         is_charge_known = np.isfinite(presses.charge_pC)
         charge = np.where(is_charge_known, presses.charge_pC, 0.0)
         log_contact = with_log_force(presses.contact)
@@ -101,11 +103,23 @@ class PressData:
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     def with_errors(self, errors: PressErrors) -> "PressData":
-        """Return a copy of these presses whose stated errors are replaced by errors of the given sizes."""
+        """Return a copy of these presses with larger or smaller standard deviations of the measurements.
+
+        The noise of the charges is replaced. The stated standard deviations of the positions are multiplied by
+        `position_ratio`. Two further errors are added to the stated errors of the forces.
+
+        Args:
+            errors: Noise of the charges, ratio for the positions, and the two further errors of the forces. The first
+                error of the forces is relative to each force. The second error is the same for all forces, and is
+                stated relative to their geometric mean.
+        """
         noise, position_ratio, force_scatter, constant_scatter = errors
         charge_std = np.where(np.isfinite(self.charge_std), noise.sigma(self.charge), UNKNOWN_STD)
-        # The sum of three independent errors. The constant error is divided by each force.
-        relative_constant = constant_scatter * np.exp(self.contact[:, 2].mean() - self.contact[:, 2])
+        # All standard deviations of forces are relative to the force F. The ratio of the geometric mean of the forces
+        # to F follows from the logarithms ln F.
+        log_force = self.contact[:, 2]
+        relative_constant = constant_scatter * np.exp(log_force.mean() - log_force)
+        # The variances of the three independent errors are added.
         force_std = np.hypot(np.hypot(self.contact_std[:, 2], force_scatter), relative_constant)
         contact_std = np.column_stack([position_ratio * self.contact_std[:, :2], force_std])
         return replace(self, charge_std=charge_std, noise=noise, contact_std=contact_std)
@@ -143,8 +157,9 @@ class Linearised:
         weight = 1.0 / data.measured_std
         residual = np.column_stack([model.charge_pC - data.charge, contact - data.contact])
         # The first rows of a press belong to its charges, and the last three to its contact. The unknowns do not change
-        # the contact (rows of zeros), and each coordinate of the contact only changes itself (identity matrix).
-        jacobian = np.pad(model.by_state, ((0, 0), (0, 3), (0, 0)))
+        # the contact (rows of zeros), and each coordinate of the contact only changes itself (identity matrix). The
+        # unknowns take the place of the state in `ModelValues`.
+        jacobian = np.pad(model.by_state, ((0, 0), (0, 3), (0, 0)))  # three further rows of zeros for each press
         contact_rows = np.tile(np.eye(3), (len(data), 1, 1))
         contact_jacobian = np.concatenate([model.by_contact, contact_rows], axis=1)
         return cls(weight * residual, weight[:, :, None] * jacobian, weight[:, :, None] * contact_jacobian)
@@ -210,12 +225,15 @@ def model_values(charges: FilmCharges, layout: Layout, time: Array, unknowns: Ar
     """
     metric_contact = in_domain(contact, charges.domain)  # (x, y, F), mm and N
     film_charge, contact_slopes, film_jacobian = charges.linearised(unknowns[layout.film], metric_contact)
-    force_slope = contact_slopes[:, :, 2] / metric_contact[:, 2:]  # with respect to F instead of ln F, pC/N
-    session_effects = [session_unknown.effect(time, film_charge, force_slope) for session_unknown in SESSION]
+    # The derivatives with respect to ln F, divided by F, are the derivatives with respect to F, pC/N.
+    force_slope = contact_slopes[:, :, 2] / metric_contact[:, 2:]
+    # The method `effect` returns the derivatives of the charges with respect to an unknown of the session.
+    session_jacobians = [session_unknown.effect(time, film_charge, force_slope) for session_unknown in SESSION]
     coefficient_jacobian = discrepancy_jacobian(film_charge, metric_contact, charges.domain)
-    jacobian = np.concatenate([film_jacobian, *session_effects, coefficient_jacobian], axis=2)
+    jacobian = np.concatenate([film_jacobian, *session_jacobians, coefficient_jacobian], axis=2)
 
-    # The charges are linear in the unknowns of the session and in the coefficients of the discrepancy.
+    # The unknowns of the session and the coefficients of the discrepancy follow those of the film. The charges are
+    # linear in these unknowns, so each unknown adds its value times its derivatives.
     beyond_film = slice(layout.film.stop, None)
     addition = jacobian[:, :, beyond_film] @ unknowns[beyond_film]
     return ModelValues(film_charge + addition, contact_slopes, jacobian)
