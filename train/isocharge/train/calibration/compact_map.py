@@ -68,10 +68,14 @@ def compact_charges(
 ) -> ChargeSeries:
     """Compute the compact charge map of an estimated film.
 
-    The map has two parts: the charges at the nodes, and the effects of the directions. The nodes are films with other
-    pretensions. The directions are the linear combinations of the unknowns of the film that change the charges. Both
-    parts are series that are fitted to the charges of random contacts. The charges at the nodes and the effects of the
-    directions take long to compute, and are computed only for the first contacts. The first contacts also cover the
+    The map has two parts, which are series that are fitted to values at random contacts:
+
+    - The charges at the nodes. The nodes are films that differ from the calibrated film only in the pretension.
+    - The effects of the directions, which are the linear combinations of the unknowns of the film that change the
+      charges.
+
+    Only the charges of the calibrated film are computed for all contacts. The charges at the nodes and the effects of
+    the directions take longer to compute, and are computed for the first of the contacts. These contacts also cover the
     domain, because the order of the contacts is random.
 
     Args:
@@ -80,38 +84,42 @@ def compact_charges(
         film: The estimate, with the noise of the charges, which decides how many directions are needed.
         executor: Executor that solves the films at the nodes; None for this process.
     """
-    # Solve the films at the nodes, which differ from the calibrated film in the pretension. Three charges only
-    # determine the contact, and show no change of the pretension. With three electrodes, the calibrated film is the
-    # only node.
+    # Solve the films at the nodes. With three electrodes, some contact explains every change of the three charges, so
+    # that no change of the pretension can be found. The calibrated film is then the only node.
     electrodes = charges.prior.sensor.electrode_names
+    # The calibrated film is its own changed film, with the change 0 and the derivatives 1.
     calibrated = _ChangedFilm(0.0, charges, film.film_values, np.eye(film.film_values.size))
-    films = [calibrated]
-    if len(electrodes) > len(CONTACT):
-        films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
-    node_MPa = np.array([node_film.change_MPa for node_film in films])
+    node_films = [calibrated]
+    if len(electrodes) > len(CONTACT):  # more charges than coordinates of a contact
+        node_films = [calibrated.changed(change_MPa, executor) for change_MPa in _nodes(film)]
+    node_MPa = np.array([node_film.change_MPa for node_film in node_films])
 
-    # Compute the charges of all contacts on the calibrated film, and those of the first contacts at all nodes.
+    # Compute the charges of all contacts on the calibrated film, and those of the first contacts at all nodes. A job is
+    # a function without arguments, which the executor calls.
     contact = draw_contacts(np.random.default_rng(SEED), domain, SERIES_CONTACTS)
-    first_contacts = contact[:CHANGE_CONTACTS]
-    node_jobs = [partial(node_film.charge, first_contacts) for node_film in films]
-    film_charge, *first_charges = in_order(executor, call, [partial(calibrated.charge, contact), *node_jobs])
+    node_contacts = contact[:CHANGE_CONTACTS]
+    node_jobs = [partial(node_film.charge, node_contacts) for node_film in node_films]
+    film_charge, *charges_at_nodes = in_order(executor, call, [partial(calibrated.charge, contact), *node_jobs])
+    # The discrepancy is the smooth difference between the real charges and those of the film with its properties.
     discrepancy = discrepancy_jacobian(film_charge, contact, charges.domain) @ film.values[film.layout.coefficients]
     charge = film_charge + discrepancy  # most probable charges without offset, shape (n, n_electrode)
 
     # Fit series to the charges at the nodes. This may leave out nodes.
-    node_charge = _node_charges(domain.to_unit(contact), charge, np.stack(first_charges, axis=1), node_MPa)
+    node_charge = _node_charges(domain.to_unit(contact), charge, np.stack(charges_at_nodes, axis=1), node_MPa)
     series = _fit_accurate_nodes(domain, electrodes, contact, node_charge, node_MPa)
 
     # Fit series to the effects of the directions, at the remaining nodes.
-    remaining_films = [node_film for node_film in films if node_film.change_MPa in series.node_MPa]
-    few_contacts = contact[:DIRECTION_CONTACTS]
-    few_charges = charge[:DIRECTION_CONTACTS]
+    remaining_films = [node_film for node_film in node_films if node_film.change_MPa in series.node_MPa]
+    direction_contacts = contact[:DIRECTION_CONTACTS]
+    direction_charges = charge[:DIRECTION_CONTACTS]  # of these contacts
     return replace(
         series,
-        directions=_directions(series, film, calibrated, remaining_films, few_contacts, few_charges, executor),
+        directions=_directions(
+            series, film, calibrated, remaining_films, direction_contacts, direction_charges, executor
+        ),
         offset_pC=film.values[film.layout.offset],
         pretension_MPa=film.value(PRETENSION.name),
-        tension_std_MPa=PRETENSION.drift,
+        tension_std_MPa=PRETENSION.drift,  # expected change of the pretension since the calibration
     )
 
 
@@ -164,6 +172,7 @@ class _ChangedFilm:
             self.values[uneven_indices] * change_MPa / changed_tension_MPa**2
         )
 
+        # Without a change, use the axisymmetric film that the calibration has solved.
         even_charges = self.charges.even
         if change_MPa != 0.0:
             even_charges = FilmCharges.of_even_film(prior, values, self.charges.domain, executor)
@@ -183,10 +192,12 @@ class _ChangedFilm:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
 
         Returns:
-            Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit.
+            Charges, shape (n, n_electrode), pC, and derivatives, shape (n, n_electrode, n_unknown), pC per unit of the
+            unknown.
         """
-        charge, _, by_changed_property = self.charges.linearised(self.values, contact)
-        by_property = by_changed_property @ self.value_jacobian  # chain rule
+        # The first derivatives are with respect to the properties of this film, and not of the calibrated film.
+        charge, _, by_own_property = self.charges.linearised(self.values, contact)
+        by_property = by_own_property @ self.value_jacobian  # chain rule
         by_offset = np.tile(np.eye(charge.shape[1]), (len(charge), 1, 1))
         by_coefficient = discrepancy_jacobian(charge, contact, self.charges.domain)
         return charge, np.concatenate([by_property, by_offset, by_coefficient], axis=2)
@@ -197,30 +208,32 @@ def _fit_accurate_nodes(
 ) -> ChargeSeries:
     """Fit a series to the charges at the nodes, and leave out the nodes at which the charges are not accurate.
 
+    The nodes are the pretensions for which charges were computed. The nodes with the largest change of the pretension
+    are left out, one after the other, until the series fits accurately or one node remains.
+
     The charges contain the imperfections of the film only to first order. At a node whose pretension differs much from
     that of the calibrated film, the imperfections may nearly cancel a charge, so that its relative error is large. A
-    smooth series does not fit such charges. If the series has a large error, the nodes with the largest change of the
-    pretension are left out, a warning is logged, and the remaining nodes are fitted again.
+    smooth series does not fit such charges. A warning is logged each time when nodes are left out.
 
     Args:
         domain: Contacts for which the series is needed.
         electrodes: Names of the electrodes.
         contact: Contacts (x, y, F), shape (n, 3), mm and N.
         charge: Charges of the contacts at the nodes, shape (n, n_node, n_electrode), pC.
-        node_MPa: Changes of the pretension at the nodes, shape (n_node,), MPa.
+        node_MPa: Changes of the pretension at the nodes, shape (n_node,), MPa, ascending and containing 0.
     """
     series = fit_film_series(domain, electrodes, contact, charge, node_MPa)
-    if series.charge_std <= MAX_SERIES_ERROR or node_MPa.size == 1:
+    if series.charge_std <= MAX_SERIES_ERROR or node_MPa.size == 1:  # `charge_std` is the relative error of the series
         return series
-    is_nearer = np.abs(node_MPa) < np.abs(node_MPa).max()
-    remaining_MPa = node_MPa[is_nearer]
+    is_kept = np.abs(node_MPa) < np.abs(node_MPa).max()
+    remaining_MPa = node_MPa[is_kept]
     log.warning(
         "the charges of this film are not known after large changes of its pretension; changes from %+.2g to "
         "%+.2g MPa can be followed",
         remaining_MPa[0],
         remaining_MPa[-1],
     )
-    return _fit_accurate_nodes(domain, electrodes, contact, charge[:, is_nearer], remaining_MPa)
+    return _fit_accurate_nodes(domain, electrodes, contact, charge[:, is_kept], remaining_MPa)
 
 
 def _nodes(film: FilmEstimate) -> Array:
@@ -233,13 +246,16 @@ def _nodes(film: FilmEstimate) -> Array:
     return np.unique(np.maximum(NODES_MPa, lowest_MPa))
 
 
-def _node_charges(unit_contact: Array, charge: Array, first_charge: Array, node_MPa: Array) -> Array:
+def _node_charges(unit_contact: Array, charge: Array, even_charge: Array, node_MPa: Array) -> Array:
     """Compute the charges of the calibrated film at the nodes from those of axisymmetric films.
+
+    The nodes are a few pretensions, between which the charges are later interpolated. One of them is the pretension of
+    the calibration.
 
     The charges of an axisymmetric film change by a certain ratio if its pretension changes from the value of the
     calibration to the value of a node. The charges of the calibrated film change by about the same ratio, although this
-    film is not axisymmetric. The ratio is a smooth function of the contact. The ratio is computed for the first
-    contacts. A series that is fitted to these ratios gives the ratios of the other contacts.
+    film is not axisymmetric. The ratio is a smooth function of the contact. The axisymmetric films are only solved for
+    the first of the contacts. A series that is fitted to their ratios gives the ratios of the other contacts.
 
     If all charges have the same sign, the change is relative to the charge itself. Otherwise, some charges are nearly
     zero, and the change is relative to the root of the sum of the squared charges of all electrodes.
@@ -247,32 +263,32 @@ def _node_charges(unit_contact: Array, charge: Array, first_charge: Array, node_
     Args:
         unit_contact: Contacts in unit coordinates, shape (n, 3).
         charge: Charges of the contacts on the calibrated film, shape (n, n_electrode), pC.
-        first_charge: Charges of the first contacts on the axisymmetric films at the nodes, shape (n_first, n_node,
-            n_electrode), pC.
+        even_charge: Charges of the first `n_first` contacts on the axisymmetric films at the nodes, shape (n_first,
+            n_node, n_electrode), pC.
         node_MPa: Changes of the pretension, one of which is zero, shape (n_node,), MPa.
 
     Returns:
         Charges, shape (n, n_node, n_electrode), pC.
     """
-    has_one_sign = np.ptp(np.sign(first_charge)) == 0.0
+    has_one_sign = np.ptp(np.sign(even_charge)) == 0.0
 
-    def change_unit(film_charge: Array) -> Array:
-        """Return the unit in which changes of charges are expressed, for charges of shape (n, 1, n_electrode)."""
+    def change_scale(film_charge: Array) -> Array:
+        """Return the charges relative to which changes are stated, for charges of shape (n, 1, n_electrode), pC."""
         return film_charge if has_one_sign else np.linalg.norm(film_charge, axis=2, keepdims=True)
 
     # Compute the relative changes of the charges of the first contacts, shape (n_first, n_node, n_electrode).
-    first_charge_before = first_charge[:, node_MPa == 0.0]  # shape (n_first, 1, n_electrode)
-    first_changes = (first_charge - first_charge_before) / change_unit(first_charge_before)
+    even_charge_before = even_charge[:, node_MPa == 0.0]  # shape (n_first, 1, n_electrode)
+    first_changes = (even_charge - even_charge_before) / change_scale(even_charge_before)
 
-    # Fit a series with one value for each node and electrode. Evaluate it for the other contacts, which do not exceed
-    # its range (second argument), and keep the values without the derivatives (index 0).
-    n_first, n_node, n_electrode = first_charge.shape
+    # Fit a series with one value for each node and electrode. Evaluate it for the other contacts, and keep the values
+    # without the derivatives (index 0). No contact lies outside the range of the series, so the excess is zero.
+    n_first, n_node, n_electrode = even_charge.shape
     first_contact, other_contact = np.split(unit_contact, [n_first])
     series = Series(fit_series(first_contact, first_changes.reshape(n_first, -1), *CHANGE_DEGREES))
-    other_changes = series.values_and_derivatives(other_contact, np.zeros_like(other_contact))[:, 0]
+    other_changes = series.values_and_derivatives(other_contact, excess=np.zeros_like(other_contact))[:, 0]
     all_changes = np.concatenate([first_changes, other_changes.reshape(-1, n_node, n_electrode)])
     charge_before = charge[:, None]  # shape (n, 1, n_electrode)
-    return charge_before + all_changes * change_unit(charge_before)
+    return charge_before + all_changes * change_scale(charge_before)
 
 
 def _directions(
@@ -356,6 +372,8 @@ def _value_changes(
 ) -> list[Array]:
     """Compute how the uncertainty of the unknowns changes the values v of a charge map.
 
+    A charge map contains the values v = ln Q of the charges Q, or v = Q / S if a size S of the charges is given.
+
     The unknowns are correlated. They are replaced by the same number of linear combinations that are uncorrelated and
     have the standard deviation 1. The function returns the changes of v that one standard deviation of each combination
     causes.
@@ -371,13 +389,15 @@ def _value_changes(
         One array of changes of v for each film, shape (n, n_electrode, n_unknown).
     """
     # The columns of the root contain the changes of the unknowns by one standard deviation of each combination. The
-    # unknowns are those of `_ChangedFilm.linearised`.
+    # unknowns are those of `_ChangedFilm.linearised`, whose indices in the estimate are those of three slices.
     unknowns = np.r_[film.layout.film, film.layout.offset, film.layout.coefficients]
     eigenvalues, vectors = np.linalg.eigh(film.covariance[np.ix_(unknowns, unknowns)])
     covariance_root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
 
     changes = []
-    for film_charge, jacobian in in_order(executor, call, [partial(one.linearised, contact) for one in films]):
-        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size  # dQ / dv
+    jobs = [partial(changed_film.linearised, contact) for changed_film in films]  # functions without arguments
+    for film_charge, jacobian in in_order(executor, call, jobs):
+        # dQ / dv is Q for v = ln Q, and S for v = Q / S. The limit avoids a division by zero.
+        charge_per_value = np.maximum(film_charge, LOWEST_CHARGE) if size is None else size
         changes.append((jacobian / charge_per_value[:, :, None]) @ covariance_root)
     return changes

@@ -86,19 +86,21 @@ class ContactSensitivity:
             charges: Charges of a film and of similar films.
             domain: The working area.
         """
-        # Compute the matrices J, A, P and G, which the docstring of the module defines. The derivatives J and A are
-        # divided by the standard deviations of the noise, so that its inverse covariance W is the identity matrix.
+        # The derivatives J of the charges with respect to the contact, and A with respect to the unknowns of the film,
+        # are divided by the standard deviations of the noise. Noise alone then causes errors of the contact with the
+        # covariance (J' J + P)^-1, where P is the inverse covariance of a contact anywhere in the domain. An error of
+        # the unknowns, multiplied by G = (J' J + P)^-1 J' A, gives the error of the contact, apart from the sign.
         linearised = _linearise_at(film, charges, spread_contacts(domain))
-        slopes = linearised.contact_jacobian  # J for each contact, shape (n, n_row, 3)
-        transposed_slopes = slopes.swapaxes(1, 2)  # J'
+        contact_jacobian = linearised.contact_jacobian  # J for each contact, shape (n, n_electrode + 3, 3)
+        transposed_jacobian = contact_jacobian.swapaxes(1, 2)  # J'
         # A contact that may lie anywhere in the domain has unit coordinates that are uniformly distributed from -1 to
         # 1, with the variance 1/3.
         domain_precision = np.diag(3.0 / domain.scale**2)  # P
-        noise_covariance = np.linalg.inv(transposed_slopes @ slopes + domain_precision)
-        film_gain = noise_covariance @ transposed_slopes @ linearised.jacobian  # G; the last matrix is A
+        contact_covariance = np.linalg.inv(transposed_jacobian @ contact_jacobian + domain_precision)
+        film_gain = contact_covariance @ transposed_jacobian @ linearised.jacobian  # G; the last matrix is A
         # The charges of a later contact do not depend on the offset of the forces that the load cell stated.
         film_gain[:, :, film.layout.index("force_offset")] = 0.0
-        return cls(film_gain, np.asarray(noise_covariance))
+        return cls(film_gain, np.asarray(contact_covariance))
 
     @property
     def noise_error(self) -> ContactError:
@@ -168,14 +170,14 @@ def next_presses(
     Returns:
         The presses in the order in which they are chosen, each with the errors that remain after it.
     """
-    film = film or problem.film_before
-    covariance = film.covariance
-    candidates = _candidates(problem)
+    estimate = film or problem.film_before
+    covariance = estimate.covariance  # C of all unknowns, such as the properties of the film
+    candidates = _candidates(problem)  # contacts (x, y, F), shape (n, 3), mm and N
     contact_std = (position_std_mm, position_std_mm, force_std)
     # Derivatives H of the residuals of each candidate with respect to the unknowns, shape (n, n_electrode, n_unknown).
-    # The residuals have the variance 1.
-    _, jacobian = _linearise_at(film, charges, candidates, contact_std).eliminated()
-    sensitivity = ContactSensitivity.of(film, charges, problem.domain)
+    # The contact of each press is eliminated, and the remaining residuals have the variance 1.
+    _, jacobian = _linearise_at(estimate, charges, candidates, contact_std).eliminated()
+    sensitivity = ContactSensitivity.of(estimate, charges, problem.domain)
 
     # The gain G contains the derivatives of x, y and ln F of later contacts with respect to errors of the unknowns.
     # Divide it by the errors that the noise causes, so that the squares of the three coordinates can be added. If the
@@ -191,13 +193,15 @@ def next_presses(
         # squared errors by the trace of (1 + H C H')^-1 H C G' G C H'. Compute this reduction for all candidates.
         cross_covariance = np.tensordot(jacobian, covariance, 1)  # H C, shape (n, n_electrode, n_unknown)
         residual_covariance = np.eye(jacobian.shape[1]) + cross_covariance @ jacobian.swapaxes(1, 2)  # 1 + H C H'
-        effect = np.tensordot(cross_covariance, squared_gain, 1) @ cross_covariance.swapaxes(1, 2)  # H C G' G C H'
-        reduction = np.trace(np.linalg.solve(residual_covariance, effect), axis1=1, axis2=2)  # shape (n,)
+        numerator = np.tensordot(cross_covariance, squared_gain, 1) @ cross_covariance.swapaxes(1, 2)  # H C G' G C H'
+        reduction = np.trace(np.linalg.solve(residual_covariance, numerator), axis1=1, axis2=2)  # shape (n,)
 
         # Choose the best candidate, and continue with the covariance after it.
         best = int(reduction.argmax())
-        best_rows = cross_covariance[best]
-        covariance = covariance - best_rows.T @ np.linalg.solve(residual_covariance[best], best_rows)
+        best_cross_covariance = cross_covariance[best]  # H C of this candidate
+        covariance = covariance - best_cross_covariance.T @ np.linalg.solve(
+            residual_covariance[best], best_cross_covariance
+        )
         error = sensitivity.film_error(covariance)
         x, y, force = candidates[best].tolist()
         proposed.append(ProposedPress(x, y, force, error.position_mm, error.force_percent))
@@ -222,19 +226,20 @@ def _candidates(problem: CalibrationProblem) -> Array:
         Contacts, shape (n, 3), mm and N.
     """
     domain = problem.domain
+    # The points of a sunflower cover a disk evenly. `N_CONTACTS` is the number of points.
     even_position = domain.radius * sunflower(N_CONTACTS)  # shape (N_CONTACTS, 2), mm
     # The addition replaces -0.0 by 0.0, which is easier to read.
-    rounded_position = GRID_MM * np.round(even_position / GRID_MM) + 0.0
-    rounded_position = np.unique(rounded_position, axis=0)
+    rounded_position = np.unique(GRID_MM * np.round(even_position / GRID_MM) + 0.0, axis=0)  # without duplicates
     distance = np.linalg.norm(rounded_position, axis=1)  # from the centre
     position = rounded_position[distance <= domain.radius]
 
     low, high = domain.force_range
     film_limit = force_within_stress(problem.sensor.film, problem.probe, problem.stress_limit, domain.force_range)
     high_within_stress = min(high, film_limit)
+    # `CANDIDATE_FORCES` contains fractions of the range of forces on a logarithmic scale.
     force = log_spaced_forces(np.array(CANDIDATE_FORCES), (low, high_within_stress))
-    grid_N = min(GRID_N, low)
-    rounded_force = np.clip(grid_N * np.round(force / grid_N), low, high_within_stress)
+    force_step_N = min(GRID_N, low)  # a step above the smallest force would be too coarse for small forces
+    rounded_force = np.clip(force_step_N * np.round(force / force_step_N), low, high_within_stress)
     return np.array([(x, y, force_N) for x, y in position for force_N in rounded_force])
 
 
@@ -242,6 +247,9 @@ def _linearise_at(
     film: FilmEstimate, charges: FilmCharges, contact: Array, contact_std: Sequence[float] = (UNKNOWN_STD,) * 3
 ) -> Linearised:
     """Compute the derivatives of the residuals of planned presses on a film.
+
+    The presses are assumed to be made at equal intervals of time, because their real times are not yet known. Only the
+    effect of a drift during the session depends on the times.
 
     The charges that will be measured are assumed to be those of the film, so that all residuals are zero.
 

@@ -30,7 +30,8 @@ def training_data(
 ) -> TrainingData:
     """Draw the presses from which the network of a calibrated film learns.
 
-    Each press is made on another film, which is drawn from the posterior distribution of the calibrated film.
+    Each press is made on another film, which is drawn from the posterior distribution of the calibrated film. The
+    compact charge map gives the charges of these films.
 
     Args:
         charges: Charges of the solved film and of similar films.
@@ -45,7 +46,7 @@ def training_data(
     rng = np.random.default_rng([SEED, 1])
     domain = series.domain
     contact = draw_contacts(rng, domain, N_PRESSES)
-    charge = _drawn_charges(series, rng, contact)  # shape (N_PRESSES, n_electrode), pC
+    charge = _drawn_charges(series, rng, contact)  # each on its own film, shape (N_PRESSES, n_electrode), pC
 
     # The property "drift" is the relative change of the gain during the session of measured presses. The film is
     # estimated for the middle of the session. After the session, the gain therefore differs from the estimate by half
@@ -68,7 +69,7 @@ def training_data(
 
 
 def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Array) -> Array:
-    """Draw the charges of contacts, each on another film of the posterior distribution.
+    """Compute the charges of contacts, each on a film of its own that is drawn from the posterior distribution.
 
     Args:
         series: The compact charge map of the film, which can be evaluated for similar films.
@@ -80,8 +81,8 @@ def _drawn_charges(series: ChargeSeries, rng: np.random.Generator, contact: Arra
     """
     drawn = []
     for chunk in np.array_split(contact, len(contact) // CHUNK_SIZE + 1):  # chunks limit the memory
-        # The state of a film is the change of its pretension and its deviations along the directions, which have the
-        # standard deviation 1.
+        # The state of a film is the change of its pretension and its deviations along the directions. The directions
+        # are the linear combinations of the unknowns that change the charges, scaled to the standard deviation 1.
         state = rng.standard_normal((len(chunk), 1 + series.direction_count))
         state[:, 0] = 0.0  # the pretension does not change
         drawn.append(series.in_state(chunk, state).charge_pC)
@@ -103,10 +104,12 @@ def _outside_presses(charges: FilmCharges, domain: Domain, executor: Executor | 
     Returns:
         The presses; None if there is no room for presses outside the working area.
     """
-    round_map = charges.slopes.film  # of the axisymmetric film
-    outermost = outermost_distance(round_map.sensor.film, round_map.probe.under(domain.force_range[1]))
-    if outermost <= domain.radius:
+    axisymmetric_map = charges.slopes.film  # forward map from contacts to charges, with its sensor and its probe
+    # The probe reaches farthest under the largest force.
+    outermost_mm = outermost_distance(axisymmetric_map.sensor.film, axisymmetric_map.probe.under(domain.force_range[1]))
+    if outermost_mm <= domain.radius:
         return None
-    whole_map = whole_film_map(round_map.sensor, round_map.probe, domain.force_range, executor=executor)
-    contact = Sweep(domain.radius, domain.force_range, seed=SEED).outside_presses(outermost).contact
+    # The map of the calibration covers little more than the working area. Solve presses on nearly the whole film.
+    whole_map = whole_film_map(axisymmetric_map.sensor, axisymmetric_map.probe, domain.force_range, executor=executor)
+    contact = Sweep(domain.radius, domain.force_range, seed=SEED).outside_presses(outermost_mm).contact
     return LabelledPresses(contact, whole_map.charges(contact))
