@@ -109,7 +109,7 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     """Yield all hypotheses about presses: all combinations of the sizes that are not known beforehand.
 
     The sizes are independent, so the probability of a hypothesis is the product of the probabilities of its sizes.
-    Hypotheses with the same errors of the presses follow one another, because the errors of the presses change last.
+    Hypotheses with the same errors of the presses follow one another, because these errors change most slowly.
 
     Args:
         noise: Noise of a frame from a good amplifier.
@@ -121,14 +121,14 @@ def hypotheses(noise: NoiseModel) -> Iterator[Hypothesis]:
     session_stds = [session_property.stds for session_property in SESSION]
     # Each list contains the sizes of one kind as pairs (size, probability). A combination has one pair of each list.
     lists = (noises, POSITION_RATIOS, FORCE_SCATTERS, IMPERFECTION_SCALES, DISCREPANCY_SIZES, *session_stds)
-    for combination in product(*lists):
+    for combination in product(*lists):  # from one combination to the next, the last lists change fastest
         sizes, probabilities = zip(*combination, strict=True)
-        press_noise, position_ratio, force_scatter, imperfections, discrepancy, *session_std = sizes
-        errors = PressErrors(press_noise, position_ratio, *force_scatter)
-        yield Hypothesis(imperfections, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
+        press_noise, position_ratio, force_scatters, imperfection_sizes, discrepancy, *session_std = sizes
+        errors = PressErrors(press_noise, position_ratio, *force_scatters)  # relative scatter, constant scatter
+        yield Hypothesis(imperfection_sizes, discrepancy, tuple(session_std), errors, float(np.prod(probabilities)))
 
 
-SEARCH_SIZES = np.array([1.0, 1.0, 1.0, 0.01, *(one.stds[-1][0] for one in SESSION)])
+SEARCH_SIZES = np.array([1.0, 1.0, 1.0, 0.01, *(session_property.stds[-1][0] for session_property in SESSION)])
 """Sizes of the parts of the prior covariance, used in the search for the most probable unknowns.
 
 No size is zero, so that all unknowns can differ from their means.
@@ -180,9 +180,9 @@ class Estimation:
 def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Estimation | None = None) -> Estimation:
     """Estimate a film from presses, with the derivatives of one solved film.
 
-    Each search assumes certain errors of the presses. The first search assumes the stated errors. Each further search
-    assumes the errors of the most probable hypothesis of the previous search, until no error changes. If the first
-    search finds a bad press, the second search assumes larger errors, because the stated errors may be too small.
+    Each search assumes standard deviations of the errors of the presses. The first search assumes the stated ones. Each
+    further search assumes those of the most probable hypothesis of the previous search, until none changes. If the
+    first search finds a bad press, the second search assumes larger errors, because the stated ones may be too small.
 
     Args:
         charges: Charges of a solved film and of similar films.
@@ -191,27 +191,27 @@ def estimate(charges: FilmCharges, data: PressData, prior: Prior, previous: Esti
         previous: Estimate at which the search begins; None to begin at the prior mean and the measured contacts.
     """
     all_hypotheses = list(hypotheses(data.noise))
-    assumed = PressErrors(data.noise)
-    estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, previous)
-    next_assumed = estimation.hypothesis.errors
+    assumed_errors = PressErrors(data.noise)  # the stated errors, without further errors
+    estimation = _estimate_with_errors(charges, data, assumed_errors, prior, all_hypotheses, previous)
+    next_errors = estimation.hypothesis.errors
     if estimation.is_bad.any():
         # Assume the errors of the last hypothesis, which are the largest, but only the middle size of the errors of the
         # positions. With the largest size, a press at a wrong place would not be recognised.
-        middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]
-        next_assumed = all_hypotheses[-1].errors._replace(position_ratio=middle_ratio)
+        middle_ratio, _ = POSITION_RATIOS[len(POSITION_RATIOS) // 2]  # (ratio, prior probability)
+        next_errors = all_hypotheses[-1].errors._replace(position_ratio=middle_ratio)
     for _ in range(MAX_SEARCHES):
-        if next_assumed == assumed:
+        if next_errors == assumed_errors:
             break
-        assumed = next_assumed
-        estimation = _estimate_with_errors(charges, data, assumed, prior, all_hypotheses, estimation)
-        next_assumed = estimation.hypothesis.errors
+        assumed_errors = next_errors
+        estimation = _estimate_with_errors(charges, data, assumed_errors, prior, all_hypotheses, estimation)
+        next_errors = estimation.hypothesis.errors
     return estimation
 
 
 def _estimate_with_errors(
     charges: FilmCharges,
     stated: PressData,
-    assumed: PressErrors,
+    assumed_errors: PressErrors,
     prior: Prior,
     all_hypotheses: list[Hypothesis],
     previous: Estimation | None,
@@ -221,38 +221,38 @@ def _estimate_with_errors(
     Args:
         charges: Charges of a solved film and of similar films.
         stated: The presses with their stated errors.
-        assumed: Errors of the presses that the search assumes.
+        assumed_errors: Errors of the presses that the search assumes.
         prior: Prior distribution of the unknowns.
         all_hypotheses: The hypotheses.
         previous: Estimate at which the search begins; None to begin at the prior mean and the measured contacts.
     """
-    data = stated.with_errors(assumed)
-    found = _probable_point(charges, data, prior, previous)
-    is_bad = _find_bad_presses(data.redundancy, found.chi2)
+    assumed = stated.with_errors(assumed_errors)  # the same presses with the assumed errors
+    found = _probable_point(charges, assumed, prior, previous)  # its state is the vector of the unknowns
+    is_bad = _find_bad_presses(assumed.redundancy, found.chi2)  # from the squared residuals of each press
     is_used = ~is_bad
 
-    # Linearise the charges at the point that was found, and average over the hypotheses.
+    # Linearise the charges at the unknowns and contacts that were found, and average over the hypotheses.
     average = _average_estimates(
-        charges, stated[is_used], data[is_used], prior, all_hypotheses, found.state, found.contacts[is_used]
+        charges, stated[is_used], assumed[is_used], prior, all_hypotheses, found.state, found.contacts[is_used]
     )
 
     # Compute the residuals of all presses, also of the bad ones, whose contacts remain those that were found.
     log_contact = found.contacts.copy()
     log_contact[is_used] = average.log_contact
-    model = model_values(charges, prior.layout, data.time, average.unknowns, log_contact)
-    residual, _ = Linearised.of(model, data, log_contact).eliminated()
-    press_chi2 = (residual**2).sum(axis=1)
+    model = model_values(charges, prior.layout, assumed.time, average.unknowns, log_contact)
+    residual, _ = Linearised.of(model, assumed, log_contact).eliminated()  # what no change of the contacts can reduce
+    chi2_of_press = (residual**2).sum(axis=1)
     # Divide by the number of redundant measurements. A press without redundant measurements has no residual.
-    chi2_per_measurement = press_chi2 / np.maximum(data.redundancy, 1)
-    best = average.weight.argmax()
+    chi2_per_measurement = chi2_of_press / np.maximum(assumed.redundancy, 1)
+    best = average.weight.argmax()  # index of the most probable hypothesis
     return Estimation(
         charges=charges,
         film=FilmEstimate(prior.layout, average.unknowns, average.covariance, average.noise),
         contact=in_domain(log_contact, charges.domain),
         is_bad=is_bad,
-        press_chi2=np.where(data.redundancy > 0, chi2_per_measurement, np.nan),
+        press_chi2=np.where(assumed.redundancy > 0, chi2_per_measurement, np.nan),
         chi2=float(average.chi2[best]),
-        redundancy=float(max(data.redundancy[is_used].sum(), 1)),
+        redundancy=float(max(assumed.redundancy[is_used].sum(), 1)),
         hypothesis=average.hypotheses[best],
     )
 
@@ -283,13 +283,13 @@ def _probable_point(charges: FilmCharges, data: PressData, prior: Prior, previou
     """
     # The search needs finite numbers, so the largest number replaces the infinite variance of an unknown charge.
     charge_variance = np.nan_to_num(data.charge_std**2)  # shape (n, n_electrode)
-    charge_covariance = charge_variance[:, None] * np.eye(charge_variance.shape[1])
+    charge_covariance = charge_variance[:, None] * np.eye(charge_variance.shape[1])  # one diagonal matrix per press
     problem = RobustProblem(  # its state is the vector of the unknowns
         lambda contacts, state: model_values(charges, prior.layout, data.time, state, contacts),
-        data.charge,
+        data.charge,  # measured charges
         charge_covariance,
-        prior.mean,
-        prior.covariance(SEARCH_SIZES),
+        prior.mean,  # of the unknowns, as the next line
+        prior.covariance(SEARCH_SIZES),  # with sizes that let all unknowns differ from the means
         measured_contacts=data.contact,
         contact_std=data.contact_std,
     )
@@ -327,11 +327,11 @@ class _Average(NamedTuple):
 def _average_estimates(
     charges: FilmCharges,
     stated: PressData,
-    data: PressData,
+    assumed: PressData,
     prior: Prior,
     all_hypotheses: list[Hypothesis],
-    unknowns: Array,
-    log_contact: Array,
+    start_unknowns: Array,
+    start_contact: Array,
 ) -> _Average:
     """Estimate the unknowns under each hypothesis, and average the estimates with weights.
 
@@ -341,18 +341,17 @@ def _average_estimates(
     Args:
         charges: Charges of a solved film and of similar films.
         stated: The presses with their stated errors, which each hypothesis replaces by its own errors.
-        data: The same presses with the errors that the search has assumed. The changes of the contacts are computed
-            with these errors.
+        assumed: The same presses with the errors that the search has assumed, for the changes of the contacts.
         prior: Prior distribution of the unknowns.
         all_hypotheses: The hypotheses. Those with the same errors of the presses follow one another.
-        unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
-        log_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
+        start_unknowns: Unknowns at which the charges are linearised, shape (n_unknown,).
+        start_contact: Contacts (x, y, ln F) at which the charges are linearised, shape (n, 3).
     """
     # Compare the hypotheses. Neighbours in the list with the same errors of the presses share one linearised problem.
-    model = model_values(charges, prior.layout, data.time, unknowns, log_contact)
+    model = model_values(charges, prior.layout, assumed.time, start_unknowns, start_contact)
     groups = [
-        _HypothesisGroup.of(model, stated.with_errors(errors), log_contact, unknowns, prior, list(group))
-        for errors, group in groupby(all_hypotheses, lambda one: one.errors)
+        _HypothesisGroup.of(model, stated.with_errors(errors), start_contact, start_unknowns, prior, list(group))
+        for errors, group in groupby(all_hypotheses, lambda hypothesis: hypothesis.errors)
     ]
     all_chi2, log_evidence = np.concatenate([group.chi2_and_log_evidence() for group in groups], axis=1)
     all_weights = softmax(log_evidence)
@@ -370,21 +369,21 @@ def _average_estimates(
     mean = weight @ means
 
     # The covariance of the average is the mean prior covariance, minus the mean reduction by the presses, plus the
-    # covariance of the means of the hypotheses. The mean prior covariance follows from the mean squared sizes.
-    mean_squared_sizes = weight @ np.array([one.sizes**2 for one in probable])
+    # covariance of the means of the hypotheses. The mean prior covariance has the mean squared sizes of its parts.
+    mean_squared_sizes = weight @ np.array([hypothesis.sizes**2 for hypothesis in probable])
     covariance = prior.covariance(np.sqrt(mean_squared_sizes))
-    covariance -= sum(reduction for _, reduction in posteriors)
+    covariance -= sum(weighted_reduction for _, weighted_reduction in posteriors)
     covariance += np.cov(means, rowvar=False, ddof=0, aweights=weight)
-    contact_change = Linearised.of(model, data, log_contact).contact_change(mean - unknowns)
-    gains = np.maximum([one.errors.noise.gain for one in probable], stated.noise.gain)
+    contact_change = Linearised.of(model, assumed, start_contact).contact_change(mean - start_unknowns)
+    gains = np.maximum([hypothesis.errors.noise.gain for hypothesis in probable], stated.noise.gain)  # at least stated
     return _Average(
         hypotheses=probable,
         weight=weight,
         chi2=all_chi2[is_probable],
         unknowns=np.clip(mean, *prior.bounds),
         covariance=covariance,
-        log_contact=log_contact + contact_change,
-        noise=NoiseModel("presses", stated.noise.white, float(np.sqrt(weight @ gains**2))),
+        log_contact=start_contact + contact_change,
+        noise=NoiseModel("presses", stated.noise.white, float(np.sqrt(weight @ gains**2))),  # root mean square gain
     )
 
 
@@ -434,19 +433,19 @@ class _HypothesisGroup:
             group: The hypotheses of the group.
         """
         linearised = Linearised.of(model, data, contact)
-        eliminated, eliminated_jacobian = linearised.eliminated()  # (n, n_electrode) and (n, n_electrode, n_unknown)
-        is_changed = eliminated_jacobian.any(axis=2)  # by any unknown; False for a coordinate that was not measured
-        basis, jacobian = np.linalg.qr(eliminated_jacobian[is_changed])
-        residual = basis.T @ eliminated[is_changed]
+        press_residual, press_jacobian = linearised.eliminated()  # (n, n_electrode) and (n, n_electrode, n_unknown)
+        is_changed = press_jacobian.any(axis=2)  # by any unknown; False for a coordinate that was not measured
+        basis, projected_jacobian = np.linalg.qr(press_jacobian[is_changed])  # (..., m) and (m, n_unknown)
+        projected_residual = basis.T @ press_residual[is_changed]
         # The density of a measurement contains the inverse of its standard deviation as a factor.
         log_density = -np.log(data.measured_std[np.isfinite(data.measured_std)]).sum()
         return cls(
             hypotheses=group,
             prior=prior,
-            residual=residual - jacobian @ (unknowns - prior.mean),  # at the prior means instead of the given unknowns
-            jacobian=jacobian,
-            parts=jacobian @ prior.parts @ jacobian.T,
-            other_chi2=float((eliminated**2).sum() - residual @ residual),
+            residual=projected_residual - projected_jacobian @ (unknowns - prior.mean),  # moved to the prior means
+            jacobian=projected_jacobian,
+            parts=projected_jacobian @ prior.parts @ projected_jacobian.T,  # for each part of the prior covariance
+            other_chi2=float((press_residual**2).sum() - projected_residual @ projected_residual),  # components left out
             log_volume=float(linearised.log_contact_volume + log_density),
         )
 
@@ -460,44 +459,45 @@ class _HypothesisGroup:
             Smallest sum of the squared residuals of the presses and of the prior distribution, over all values of the
             unknowns, and logarithm of the evidence. Both have the shape (n_hypothesis,).
         """
-        factors = np.linalg.cholesky(self._covariance(self._squared_sizes))  # shape (n_hypothesis, m, m)
-        weighted = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
-        chi2 = self.other_chi2 + np.array(weighted) @ self.residual  # the second term is r' S^-1 r
+        factors = np.linalg.cholesky(self._covariance(self._squared_sizes))  # of S, shape (n_hypothesis, m, m)
+        solutions = [cho_solve((factor, True), self.residual, check_finite=False) for factor in factors]  # S^-1 r
+        # `other_chi2` and `log_volume` are the terms that are the same for all hypotheses of the group.
+        chi2 = self.other_chi2 + np.array(solutions) @ self.residual  # the second term is r' S^-1 r
         log_determinant = 2.0 * np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)  # of S
-        log_density = self.log_volume - 0.5 * (chi2 + log_determinant)  # of the residuals
+        log_density = self.log_volume - 0.5 * (chi2 + log_determinant)  # without the constant that all groups share
         log_prior_probability = np.log([hypothesis.probability for hypothesis in self.hypotheses])
         return chi2, log_density + log_prior_probability
 
-    def posterior(self, weight: Array) -> tuple[Array, Array]:
+    def posterior(self, hypothesis_weights: Array) -> tuple[Array, Array]:
         """Estimate the unknowns under each of the n hypotheses whose weight is positive.
 
-        The estimate under a hypothesis is a normal distribution. With the symbols of the class, its mean is the prior
-        mean minus P J' S^-1 r. Its covariance is P - P J' S^-1 J P: the prior covariance minus a reduction, which the
-        presses cause.
+        The estimate under a hypothesis is a normal distribution. Its mean is the prior mean minus P J' S^-1 r, where P
+        is the prior covariance, J are the derivatives of the residuals r, and S is the covariance of r. Its covariance
+        is P - P J' S^-1 J P: the prior covariance minus a reduction, which the presses cause.
 
         Args:
-            weight: Weight of each hypothesis, shape (n_hypothesis,).
+            hypothesis_weights: Weight of each hypothesis, shape (n_hypothesis,).
 
         Returns:
             Means of the unknowns under the n hypotheses, shape (n, n_unknown), and the weighted sum of the reductions
             of the covariance under these hypotheses, shape (n_unknown, n_unknown).
         """
-        is_used = weight > 0.0
-        squared_sizes = self._squared_sizes[is_used]  # shape (n, n_part)
+        is_used = hypothesis_weights > 0.0
+        squared_sizes = self._squared_sizes[is_used]  # P is the sum of these times its parts; shape (n, n_part)
         residual_covariance = self._covariance(squared_sizes)  # S, shape (n, m, m)
         jacobian_by_part = self.jacobian @ self.prior.parts  # J times each part of P, shape (n_part, m, n_unknown)
         cross_covariance = np.tensordot(squared_sizes, jacobian_by_part, 1)  # J P, shape (n, m, n_unknown)
         gain = np.linalg.solve(residual_covariance, cross_covariance)  # S^-1 J P, shape (n, m, n_unknown)
         means = self.prior.mean - self.residual @ gain
         # Multiply (J P)' by S^-1 J P. The product is summed over the hypotheses (axis 0) and the residuals (axis 1).
-        weighted_gain = weight[is_used, None, None] * gain
-        reduction = np.tensordot(cross_covariance, weighted_gain, axes=((0, 1), (0, 1)))
-        return means, reduction
+        weighted_gain = hypothesis_weights[is_used, None, None] * gain
+        weighted_reduction = np.tensordot(cross_covariance, weighted_gain, axes=((0, 1), (0, 1)))
+        return means, weighted_reduction
 
     @property
     def _squared_sizes(self) -> Array:
         """Squared sizes of the parts of the prior covariance, shape (n_hypothesis, n_part)."""
-        return np.array([one.sizes**2 for one in self.hypotheses])
+        return np.array([hypothesis.sizes**2 for hypothesis in self.hypotheses])
 
     def _covariance(self, squared_sizes: Array) -> Array:
         """Compute the covariances S of the residuals, shape (n, m, m), for squared sizes of shape (n, n_part)."""
