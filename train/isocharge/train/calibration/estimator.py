@@ -445,7 +445,7 @@ class _HypothesisGroup:
             residual=projected_residual - projected_jacobian @ (unknowns - prior.mean),  # moved to the prior means
             jacobian=projected_jacobian,
             parts=projected_jacobian @ prior.parts @ projected_jacobian.T,  # for each part of the prior covariance
-            other_chi2=float((press_residual**2).sum() - projected_residual @ projected_residual),  # components left out
+            other_chi2=float((press_residual**2).sum() - projected_residual @ projected_residual),  # the other parts
             log_volume=float(linearised.log_contact_volume + log_density),
         )
 
