@@ -121,21 +121,23 @@ def check_channels(presses: MeasuredPresses, charges: FilmCharges) -> None:
         if np.isnan(channel_charge).all():
             raise PressError(f"electrode {name!r}: no press has a charge of it; a calibration needs all electrodes")
 
-    placed = presses[presses.placed]
-    film_charges = expected_charges(charges, placed.contact)
-    # A ratio is the typical charge of a channel, divided by that of all channels. Find the smallest ratio that a
-    # working channel may have. If all places are unknown, all presses may be far from an electrode. Otherwise, use the
-    # smallest ratio on a few films, but at most 1, so that large expected charges of a channel do not raise its limit.
+    placed = presses[presses.placed]  # presses with a known place and force
+    film_charges = expected_charges(charges, placed.contact)  # shape (n_film, n, n_electrode), pC
+    # The charge ratio of a channel is its typical charge, divided by that of all channels. Find the smallest charge
+    # ratio that a working channel usually has. Without known places, one ratio holds for all channels. It is small,
+    # because all presses may be far from an electrode.
     smallest_usual_ratio = np.array(UNPLACED_RATIO)
     if len(placed):
+        # Use the smallest charge ratio of each channel on a few films, shape (n_electrode,). A ratio above 1 counts as
+        # 1, so that large expected charges of a channel do not raise its limit.
         film_ratios = [_charge_ratios(film_charge) for film_charge in film_charges]
         smallest_usual_ratio = np.min(film_ratios, axis=0, initial=1.0)
-    ratio = _charge_ratios(presses.charge_pC)
-    for channel in np.flatnonzero(ratio < MAX_DEAD_RATIO * smallest_usual_ratio):
+    charge_ratio = _charge_ratios(presses.charge_pC)
+    for channel in np.flatnonzero(charge_ratio < MAX_DEAD_RATIO * smallest_usual_ratio):  # the first one is reported
         typical_charge = np.nanmedian(np.abs(presses.charge_pC[:, channel]))
         raise PressError(
             f"electrode {presses.electrodes[channel]!r} is dead: half of its charges are below "
-            f"{typical_charge:.3g} pC, {100.0 * ratio[channel]:.2g} % of those of the others; check "
+            f"{typical_charge:.3g} pC, {100.0 * charge_ratio[channel]:.2g} % of those of the others; check "
             "the channel, its unit, its cable and its amplifier"
         )
     _check_signs(placed, film_charges)
@@ -157,7 +159,7 @@ def _check_signs(presses: MeasuredPresses, film_charges: Array) -> None:
             "the charges of all electrodes have the opposite sign to those of the film; exchange the wires, change the "
             "sign of the charges, or change the signs of d31 and d32 in the sensor file"
         )
-    for channel in reversed_channels:
+    for channel in reversed_channels:  # the first one is reported
         raise PressError(
             f"electrode {presses.electrodes[channel]!r}: {opposite_counts[channel]} of its {measured_counts[channel]} "
             "charges have the opposite sign to those of the film; exchange its wires or its sign, or check the order "
@@ -194,6 +196,7 @@ def expected_charges(charges: FilmCharges, contact: Array) -> Array:
     films = np.tile(prior.mean, (len(PRETENSIONS_MPa), 1))
     films[:, prior.index("pretension")] = PRETENSIONS_MPa
     contact_in_domain = in_domain(with_log_force(contact), charges.domain)
+    # The object `charges` computes the charges of any film from its properties.
     return np.array([charges.charges(values, contact_in_domain) for values in films])
 
 
@@ -218,7 +221,8 @@ def find_mistakes(presses: MeasuredPresses, charges: FilmCharges) -> list[str]:
         sentence: misfit(replace(placed_presses, contact=contact, charge_pC=charge), charges)
         for sentence, contact, charge in _possible_corrections(placed_presses, charges)
     }
-    # A misfit is clearly smaller than another misfit if it is less than `BETTER_MISFIT_RATIO` of the other.
+    # A misfit is clearly smaller than another misfit if it is less than `BETTER_MISFIT_RATIO` of the other. A corrected
+    # misfit must be clearly smaller than that of the uncorrected presses, and it must not be suspicious itself.
     largest_accepted = min(BETTER_MISFIT_RATIO * misfit(placed_presses, charges), SUSPICIOUS_MISFIT)
     smallest = min(corrected_misfits.values())
     probable = [
@@ -233,11 +237,11 @@ def misfit(presses: MeasuredPresses, charges: FilmCharges) -> float:
     """Compute the misfit between the charges of presses and the charges of the film that agrees best with them.
 
     The compared films are those of `expected_charges`, which differ in their pretension. The misfit of one film is
-    computed from the logarithms of the ratios of measured charges to the charges of the film. It is the sum of two
-    terms. The first term is the mean squared deviation of the logarithms from their median, divided by `SCATTER_STD`
-    squared. Each squared deviation is limited to `MAX_SQUARED_DEVIATION`. The second term is the squared median of the
-    logarithms, divided by `OFFSET_STD` squared. The function returns the smallest misfit of all films. Correctly
-    recorded presses usually have a misfit of about 1, and a misfit of 20 indicates a mistake in the records.
+    computed from the logarithms of the ratios of measured charges to the charges of the film. The median of these
+    logarithms is the offset. The misfit is the mean squared deviation from the offset, divided by `SCATTER_STD`
+    squared, plus the squared offset, divided by `OFFSET_STD` squared. Each squared deviation is limited to
+    `MAX_SQUARED_DEVIATION`. The function returns the smallest misfit of all films. Correctly recorded presses usually
+    have a misfit of about 1, and a misfit of 20 indicates a mistake in the records.
 
     Args:
         presses: The measured presses. Only presses with a known place and force are used. Without such presses, the
@@ -307,8 +311,8 @@ def _possible_corrections(presses: MeasuredPresses, charges: FilmCharges) -> Ite
         yield sentence, contact, charge[:, column_of_electrode]
 
     # The gain of a channel is the median ratio of measured to expected charges over the similar films (axis 0) and the
-    # presses (axis 1), relative to the median over all channels. A channel with the wrong sign has no gain, so the
-    # logarithms of the gains are limited.
+    # presses (axis 1), relative to the median over all channels. If the charges of a channel have the wrong sign, the
+    # logarithm of their ratio is a very large negative number. The limits keep the gain and its inverse finite.
     log_ratios = np.nanmedian(_log_ratio(charge, expected_charges(charges, contact)), axis=(0, 1))
     log_gains = np.clip(log_ratios - np.median(log_ratios), -3.0, 3.0)
     for column, gain in enumerate(np.exp(log_gains)):
@@ -337,7 +341,7 @@ def _plausible_electrode_orders(presses: MeasuredPresses, charges: FilmCharges) 
 
     Returns:
         Set of assignments. Each assignment contains, for each column, the index of the electrode to which its charges
-        belong. The set does not include the order in which the columns are written.
+        belong. The assignment in which each column belongs to the electrode of its name is left out.
     """
     electrode_orders = set()
     for expected in expected_charges(charges, presses.contact):
@@ -364,7 +368,7 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
         charges: Charges of a film and of similar films.
         reason: Reason why the presses are refused, as a part of a sentence.
     """
-    prior = charges.prior
+    prior = charges.prior  # with the described sensor and probe
     statement = f"no film of {prior.sensor.name!r} explains these {len(presses)} presses: {reason}"
     alternatives = "; or ".join(find_mistakes(presses, charges)[:3])
     advice = (
@@ -378,7 +382,7 @@ def unexplained_error(presses: MeasuredPresses, charges: FilmCharges, reason: st
 
 def is_one_place(presses: MeasuredPresses) -> bool:
     """Return whether at least one position is known, and all known positions are equal within their errors."""
-    is_known = np.isfinite(presses.contact[:, 0])
+    is_known = np.isfinite(presses.contact[:, 0])  # x and y are either both known or both unknown
     if not is_known.any():
         return False
     largest_range_mm = np.ptp(presses.contact[is_known, :2], axis=0).max()  # the larger of the ranges of x and y

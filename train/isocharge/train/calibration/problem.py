@@ -60,8 +60,8 @@ class CalibrationProblem:
             SensorError: If the pretension of the film is too large.
         """
         check_electrode_count(len(self.sensor.electrodes))
-        check_family(self.sensor.film, self.probe, self.domain)
-        _, largest = PRETENSION.limits
+        check_family(self.sensor.film, self.probe, self.domain)  # the press at the edge of the working area can exist
+        _, largest = PRETENSION.limits  # smallest and largest pretension, MPa
         if self.sensor.film.pretension > largest:
             raise SensorError(
                 f"{self.sensor.name}: film.pretension_MPa: expected at most {largest:g} MPa, up to which a calibration "
