@@ -100,10 +100,11 @@ def film_table(problem: CalibrationProblem, film: FilmEstimate) -> dict[str, Any
         "force_range_N": list(problem.force_range),
         "noise": film.noise,
         "unknowns": {
-            name: {"value": value, "std": one_std}
-            for name, value, one_std in zip(layout.names, film.values, std, strict=True)
+            name: {"value": value, "std": unknown_std}
+            for name, value, unknown_std in zip(layout.names, film.values, std, strict=True)
         },
-        "correlations": [row[:index] for index, row in enumerate(rounded_correlations)],  # the lower triangle
+        # The lower triangle without the diagonal: row i has i numbers.
+        "correlations": [row[:index] for index, row in enumerate(rounded_correlations)],
         "described_sensor": sensor_to_dict(problem.sensor),
     }
 
@@ -131,11 +132,11 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
     _check_same_problem(path, content, problem)
 
     layout = problem.prior.layout
-    unknowns = content.unknowns.values()
+    unknowns = content.unknowns.values()  # in the order of the layout, as `_check_same_problem` ensures
     values = np.array([unknown.value for unknown in unknowns])
     std = np.array([unknown.std for unknown in unknowns])
     for film_property in layout.prior.properties:
-        low, high = film_property.limits
+        low, high = film_property.limits  # a calibration finds no value outside
         value = content.unknowns[film_property.name].value
         if not low <= value <= high:
             raise PressError(
@@ -147,9 +148,16 @@ def read_film(path: Path, problem: CalibrationProblem) -> FilmEstimate:
 
 
 def _check_same_problem(path: Path, content: _CalibrationFile, problem: CalibrationProblem) -> None:
-    """Raise PressError if a file belongs to another calibration problem."""
-    # The estimated properties are changes from the values of the sensor file. Added to the values of another sensor
-    # file, they would describe another film.
+    """Raise PressError if a file belongs to another calibration problem.
+
+    The estimated properties are changes from the values of the sensor file. Added to the values of another sensor file,
+    they would describe another film.
+
+    Args:
+        path: The file calibration.json.
+        content: Entries of the file. The entry `described_sensor` is the sensor file with which it was written.
+        problem: The present calibration problem.
+    """
     described = plain_values(sensor_to_dict(problem.sensor))
     differences = [key for key in described if described[key] != content.described_sensor.get(key)]
     if differences:
@@ -191,7 +199,7 @@ def _correlation_matrix(path: Path, rows: list[list[float]], count: int) -> Arra
             f"{path}: correlations: expected {count} rows of 0 to {count - 1} numbers, the lower triangle of a matrix, "
             f"got {len(rows)} rows of other lengths; calibrate again"
         )
-    lower_triangle = np.eye(count)
+    lower_triangle = np.eye(count)  # the diagonal of a correlation matrix is 1; the upper triangle is not used
     lower_triangle[np.tril_indices(count, -1)] = [number for row in rows for number in row]
     eigenvalues, vectors = np.linalg.eigh(lower_triangle, UPLO="L")  # of the symmetric matrix with this triangle
     largest_rounding_error = count * 10.0**-CORRELATION_DIGITS  # of an eigenvalue, if each correlation was rounded
@@ -239,6 +247,7 @@ def check_calibration_folder(folder: Path, electrodes: tuple[str, ...]) -> None:
     versions = version_folders(folder)
     next_version = max(versions, default=0) + 1
     check_target(folder, next_version, electrodes)
+    # A model that no calibration has written lacks the file with the estimate of the film.
     has_calibration = any((version / RESULT).is_file() for version in versions.values())
     is_empty = not folder.exists() or all(path.name.startswith(".") for path in folder.iterdir())
     if not (has_calibration or is_empty):
@@ -345,8 +354,9 @@ def usable_held_out(
     """
     sensor_name = problem.sensor.name
     held_out = held_out.of_electrodes(problem.electrodes, sensor_name)
-    learned = presses.of_electrodes(problem.electrodes, sensor_name)
-    _refuse_learned(held_out, learned, "held-out presses that are not among those of the calibration")
+    calibration_presses = presses.of_electrodes(problem.electrodes, sensor_name)
+    # The text is a part of the error message: "expected ..., got the same charges".
+    _refuse_learned(held_out, calibration_presses, "held-out presses that are not among those of the calibration")
 
     has_all_charges = np.isfinite(held_out.charge_pC).all(axis=1)
     has_position_or_force = np.isfinite(held_out.contact).any(axis=1)
@@ -441,7 +451,7 @@ def read_earlier(folder: StrPath, problem: CalibrationProblem, *presses: Measure
             expected = f"presses that are not among those of the earlier calibration {version}"
             for new_presses in filter(None, presses):
                 _refuse_learned(new_presses, learned, expected)
-    return film.drifted()
+    return film.drifted()  # with the uncertainty that a drift since then adds
 
 
 def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> str:
@@ -451,15 +461,15 @@ def _film_section(result: CalibrationResult, made_with: Mapping[str, Any]) -> st
         result: Result of the calibration.
         made_with: Entries of the metadata, which may contain the factor of the standard deviations.
     """
-    probe = result.problem.probe.rotated_notation
+    probe = result.problem.probe.rotated_notation  # the text that describes the probe
     sentences = [*result.summary, *(f"Caution: {caution}." for caution in result.cautions)]
     if "std_factor" in made_with:
         sentences.append(f"Held-out presses: {StdFactor(**made_with['std_factor']).statement}.")
     summary_list = "\n".join(f"- {sentence}" for sentence in sentences)
     property_rows = "\n".join(
-        f"| `{name}` | {one.meaning} | {one.value:.4g} | {one.std:.2g} | {one.before_std:.2g} | "
-        f"{'' if one.unit == '1' else one.unit} | {'yes' if one.identified else 'no'} |"
-        for name, one in result.properties.items()
+        f"| `{name}` | {entry.meaning} | {entry.value:.4g} | {entry.std:.2g} | {entry.before_std:.2g} | "
+        f"{'' if entry.unit == '1' else entry.unit} | {'yes' if entry.identified else 'no'} |"
+        for name, entry in result.properties.items()
     )
     return f"""## The film
 

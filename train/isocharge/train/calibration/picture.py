@@ -24,15 +24,15 @@ def calibration_picture(result: CalibrationResult) -> Figure:
     map_axes, residual_axes = figure.subplots(1, 2)
 
     # The position error at each contact, the electrodes and the presses
-    x, y, _ = spread_contacts(result.problem.domain).T
-    error_mm = result.sensitivity.film_limits(result.film.covariance).position
-    points = map_axes.scatter(x, y, c=error_mm, s=60)
+    map_x, map_y, _ = spread_contacts(result.problem.domain).T
+    position_error_mm = result.sensitivity.film_limits(result.film.covariance).position  # at each contact
+    points = map_axes.scatter(map_x, map_y, c=position_error_mm, s=60)
     figure.colorbar(points, ax=map_axes, label="position error by the film, mm")
-    error = result.film_error
+    error = result.film_error  # root mean square over the contacts
     sensor, _ = result.sensor_and_probe
     title = f"{len(result.presses)} presses leave {error.position_mm:.2g} mm, {error.force_percent:.2g} % of force"
     draw_layout(map_axes, sensor, result.problem.domain.radius, title)
-    x, y, _ = result.estimation.contact.T
+    x, y, _ = result.estimation.contact.T  # of the presses
     is_bad = result.estimation.is_bad
     map_axes.plot(x[~is_bad], y[~is_bad], "o", color="white", mec=INK, ms=6, label="presses")
     if is_bad.any():

@@ -96,8 +96,8 @@ class CalibrationResult:
         estimates = {}
         for declared in self.film.layout.prior.properties:
             name = declared.name
-            # Without an earlier calibration, `film_before` is used to plan presses, and has only half of the declared
-            # standard deviations of imperfections.
+            # After an earlier calibration, `film_before` is its estimate. Otherwise, `film_before` is used to plan
+            # presses, and has only half of the declared standard deviations of imperfections.
             before_std = declared.std if self.problem.earlier is None else before.std(name)
             value = self.film.value(name)
             std = self.film.std(name)
@@ -108,7 +108,7 @@ class CalibrationResult:
     @property
     def summary(self) -> tuple[str, ...]:
         """Sentences about contact errors, the properties that the presses determine, the discrepancy, and the noise."""
-        after = self.film_error
+        after = self.film_error  # errors of contacts after the presses
         before = self.film_error_before
         noise = self.sensitivity.noise_error
         sentences = [
@@ -118,9 +118,9 @@ class CalibrationResult:
         ]
         identified = [estimate for estimate in self.properties.values() if estimate.identified]
         if identified:
-            texts = [
+            texts = [  # the unit of a ratio, " 1", is not shown
                 f"{estimate.meaning} {estimate.value:.3g} +- {estimate.std:.2g} {estimate.unit}".removesuffix(" 1")
-                for estimate in identified  # " 1" is the unit of a ratio
+                for estimate in identified
             ]
             sentences.append(
                 "The presses determine the following changes from the sensor file (of the mean pretension, the value "

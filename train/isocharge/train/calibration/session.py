@@ -76,9 +76,10 @@ def read_answer(text: str) -> Answer:
     separator = "," if "," in value_text else None  # None: any blanks
     cells = [cell.strip() for cell in value_text.split(separator)]
     if len(cells) != len(CONTACT) or not all(map(_CELL.fullmatch, cells)):
-        # The message repeats at most 60 characters of the text.
+        # The message repeats at most 60 characters of the text in quotes (!r:.60).
         raise PressError(f"expected {EXPECTED_ANSWER}; got {text.strip()!r:.60}")
-    values = [float(cell) if cell.strip("?") else np.nan for cell in cells]  # unknown: empty or a question mark
+    # A cell is unknown if it is empty or a question mark: nothing remains without question marks.
+    values = [float(cell) if cell.strip("?") else np.nan for cell in cells]
     return Answer("take", np.array(values))
 
 
@@ -125,7 +126,7 @@ class PressSession:
         self.problem = problem
         self._executor = executor
         self._save = save
-        self._until = until
+        self._sufficient_ratio = until
         self._stds = {"position_std_mm": position_std_mm, "force_std": force_std}
         presses = presses or MeasuredPresses(
             contact=np.empty((0, 3)),
@@ -133,7 +134,7 @@ class PressSession:
             position_std_mm=np.empty(0),
             force_std=np.empty(0),
             electrodes=problem.electrodes,
-            lines=(),
+            lines=(),  # numbered below
         )
         # The saved file has the presses on the lines after its header, which is line 1.
         self._fit(replace(presses, lines=tuple(range(2, len(presses) + 2))))
@@ -156,7 +157,7 @@ class PressSession:
             # If there are no presses, or no film explains them, all presses are planned from the beginning. The presses
             # so far count as the first presses of this plan, and the press after them is proposed.
             film = None if self.result is None else self.result.film
-            planned_count = len(self) + 1 if film is None else 1
+            planned_count = 1 if film is not None else len(self) + 1
             plan = next_presses(self.problem, self._charges, planned_count, film, **self._stds)
             self._proposed = plan[-1]
         return self._proposed
@@ -167,7 +168,7 @@ class PressSession:
         if self.result is None or len(self) < FEW_PRESSES:
             return False
         noise_mm = self.result.sensitivity.noise_error.position_mm
-        return self.result.film_error.position_mm <= self._until * noise_mm
+        return self.result.film_error.position_mm <= self._sufficient_ratio * noise_mm
 
     def take(self, charge: Array, contact: Array) -> None:
         """Add a press, save all presses, and fit the film to them.
@@ -189,10 +190,13 @@ class PressSession:
             force_std=np.append(presses.force_std, self._stds["force_std"]),
             lines=(*presses.lines, len(presses) + 2),
         )
-        self._change(extended_presses)
+        self._save_and_fit(extended_presses)
 
     def check(self, contact: Array) -> None:
         """Raise PressError if a calibration does not accept presses with a given contact.
+
+        A contact is refused if only one of x and y is known, or if a known position or force is outside the solved
+        domain.
 
         Args:
             contact: Contact (x, y, F) of the press, shape (3,), mm and N, NaN where unknown.
@@ -213,13 +217,13 @@ class PressSession:
         Raises:
             PressError: If there is no press.
         """
-        count = len(self)
+        count = len(self)  # also the number of the last press
         if not count:
             raise PressError("there is no press to undo yet")
-        self._change(self.presses[:-1])
+        self._save_and_fit(self.presses[:-1])
         return count
 
-    def _change(self, presses: MeasuredPresses) -> None:
+    def _save_and_fit(self, presses: MeasuredPresses) -> None:
         """Save a changed list of presses, and fit the film to the presses in the list."""
         self._save(presses)
         self._fit(presses)
@@ -240,7 +244,8 @@ class PressSession:
         if not len(presses):
             return
         try:
-            # Unevenness is a first-order change here, because the next press must be proposed at once.
+            # The next press must be proposed at once. With accurate=False, an uneven film is not solved, and its
+            # unevenness is only a first-order change of the charges.
             self.result = calibrate(presses, self.problem, executor=self._executor, start=self._charges, accurate=False)
         except PressError as error:
             self.refusal = str(error)
