@@ -188,7 +188,7 @@ def _fit_film(
         estimation = estimate(charges, data, problem.prior, estimation)
 
     # Search for mistakes again if the estimate assumes larger errors than stated, or has a property at a bound.
-    is_at_bound = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)  # (lower, upper)
+    is_at_bound = np.equal(estimation.film.film_values, problem.prior.layout.prior.bounds)  # lower or upper
     is_doubtful = estimation.hypothesis.errors.position_ratio > 1.0 or is_at_bound.any()
     if is_doubtful and find_mistakes(presses, charges):
         raise unexplained_error(

@@ -119,7 +119,7 @@ def compact_charges(
         ),
         offset_pC=film.values[film.layout.offset],
         pretension_MPa=film.value(PRETENSION.name),
-        tension_std_MPa=PRETENSION.drift,  # expected change of the pretension since the calibration
+        tension_std_MPa=PRETENSION.drift,  # standard deviation of its change since the calibration
     )
 
 

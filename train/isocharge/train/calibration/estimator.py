@@ -336,7 +336,7 @@ def _average_estimates(
     """Estimate the unknowns under each hypothesis, and average the estimates with weights.
 
     The weight of a hypothesis is its evidence, divided by the sum of the evidence of all hypotheses. Hypotheses with a
-    weight below `MIN_WEIGHT` are left out. The charges are linearised at given unknowns and contacts.
+    weight below `MIN_WEIGHT` are left out. A hypothesis states errors of presses and sizes of the parts of the prior.
 
     Args:
         charges: Charges of a solved film and of similar films.

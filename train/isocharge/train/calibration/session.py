@@ -158,6 +158,7 @@ class PressSession:
             # so far count as the first presses of this plan, and the press after them is proposed.
             film = None if self.result is None else self.result.film
             planned_count = 1 if film is not None else len(self) + 1
+            # `_stds` contains the standard deviations of the positions and forces of further presses.
             plan = next_presses(self.problem, self._charges, planned_count, film, **self._stds)
             self._proposed = plan[-1]
         return self._proposed
