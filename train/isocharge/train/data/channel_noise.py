@@ -106,22 +106,24 @@ class ChannelNoise(GaussianNoise):
         noisy_charge = different_rows[:, 3:]
 
         # Estimate the charges without noise at repeated contacts, shape (m, n_electrode).
+        # Each of the m presses at a repeated contact has one row. The rows of a contact contain the same mean charges.
         estimated_charge, residual = _repeated_residuals(contact, noisy_charge)
         # Count the repeated contacts that show the noise of a channel. A contact at which the channel is silent does
         # not show its noise.
         charges_of_contacts = np.unique(estimated_charge, axis=0)  # one row for each repeated contact
         contact_counts = np.count_nonzero(charges_of_contacts, axis=0)  # shape (n_electrode,)
         if contact_counts.min() < MIN_REPEATED_CONTACTS:  # estimate the charges at all contacts by quadratic functions
-            planes = LocalPlanes.fit(contact, noisy_charge)
+            planes = LocalPlanes.fit(contact, noisy_charge)  # tangents of quadratic functions
             estimated_charge = planes.value
             residual = planes.residual
 
         # Fit the noise of each channel.
-        channels = zip(estimated_charge.T, residual.T, strict=True)
-        white_std, gain_std = np.transpose([_fit_noise(*channel) for channel in channels])
-        gain = np.maximum(gain_std, MIN_GAIN_NOISE)
-        smallest_white = MIN_WHITE_RATIO * gain * median_magnitude(noisy_charge)
-        return cls(np.maximum(white_std, smallest_white), gain)
+        white_std, gain_std = np.transpose(
+            [_fit_noise(charges, residuals) for charges, residuals in zip(estimated_charge.T, residual.T, strict=True)]
+        )
+        gain_noise = np.maximum(gain_std, MIN_GAIN_NOISE)
+        min_white_noise = MIN_WHITE_RATIO * gain_noise * median_magnitude(noisy_charge)
+        return cls(np.maximum(white_std, min_white_noise), gain_noise)
 
     @classmethod
     def alike(cls, noise: NoiseModel) -> "ChannelNoise":
@@ -201,11 +203,11 @@ class LocalPlanes:
         are scaled so that their variance is equal to that of the noise of a single press.
 
         Args:
-            unit_contact: Contacts in unit coordinates, shape (n, 3).
-            values: Values at the contacts, such as charges, shape (n, k).
+            unit_contact: Contacts of the presses in unit coordinates, shape (n_press, 3).
+            values: Values of the presses, such as charges, shape (n_press, k).
 
         Returns:
-            The planes, one for each different contact.
+            The planes, one for each of the n different contacts.
         """
         # Find the neighbours of each contact. The nearest contact is the contact itself.
         contact, mean_value, press_count, _ = _average_repeated(unit_contact, values)
@@ -250,6 +252,8 @@ class LocalPlanes:
         Returns:
             Differences, shape (m, k).
         """
+        # The n planes have the values `self.value`, shape (n, k), the slopes `self.slope`, shape (n, k, 3), and the
+        # distances `self.reach` to their farthest neighbours, shape (n,).
         # Indices of the candidates, shape (m, N_CANDIDATE_PLANES)
         _, candidate_planes = cKDTree(self.value).query(values, N_CANDIDATE_PLANES)
         inverse_slope = np.linalg.pinv(self.slope)  # shape (n, 3, k)
@@ -289,7 +293,8 @@ def _average_repeated(unit_contact: Array, values: Array) -> tuple[Array, Array,
     _, contact_of_press, press_count = np.unique(rounded_contact, axis=0, return_inverse=True, return_counts=True)
     contact_of_press = contact_of_press.ravel()  # some versions of NumPy return two axes
 
-    # Compute the mean of each coordinate and of each value over the presses of each contact.
+    # Compute the mean of each coordinate and of each value over the presses of each contact. The first three columns
+    # of the table are the coordinates.
     table = np.column_stack([unit_contact, values])
     sums = np.column_stack([np.bincount(contact_of_press, column) for column in table.T])
     contact, mean_value = np.split(sums / press_count[:, None], [3], axis=1)
@@ -313,7 +318,7 @@ def _repeated_residuals(unit_contact: Array, charge: Array) -> tuple[Array, Arra
     is_repeated = press_count[contact_of_press] > 1
     repeated_contact = contact_of_press[is_repeated]
     mean = mean_charge[repeated_contact]
-    count = press_count[repeated_contact, None]
+    count = press_count[repeated_contact, None]  # number of presses at the contact of each press, shape (m, 1)
     # The variance of a difference from the mean of k charges is (k - 1) / k times that of the noise.
     difference = charge[is_repeated] - mean
     return mean, difference * np.sqrt(count / (count - 1))
@@ -348,22 +353,27 @@ def _fit_noise(charge: Array, residual: Array) -> Array:
     """
     is_silent = (charge == 0.0) & (residual == 0.0)
     square_limit = OUTLIER_STDS**2
-    smallest_number = np.finfo(float).tiny  # keeps the units and the variances above zero
+    smallest_positive = np.finfo(float).tiny  # keeps the units and the variances above zero
     # White noise of the size rms(residual) would explain the residuals without noise of the gain. Noise of the gain of
     # the size rms(residual) / rms(charge) would explain them without white noise. White and gain are searched in these
-    # units, because charges may be very large or small, and as logarithms, because they are positive.
-    units = smallest_number + rms(residual) / np.array([1.0, rms(charge)])
+    # units, because charges may be very large or small, and as logarithms, because they are positive. The first unit is
+    # that of white, pC, and the second unit is that of gain, dimensionless.
+    units = smallest_positive + rms(residual) / np.array([1.0, rms(charge)])
 
     def loss(log_std: Array) -> float:
         """Return the mean over the residuals of -2 times the logarithm of their density, up to a constant.
 
+        The arrays `charge` and `residual` contain estimated charges without noise and the residuals of one channel.
+        Residuals that `is_silent` marks do not count, because the silent channel does not show its noise there.
+
         Args:
-            log_std: Logarithms of white and gain in their units, shape (2,).
+            log_std: Logarithms of (white noise / first unit) and (gain noise / second unit), shape (2,). The array
+                `units` contains both units.
         """
         white, gain = units * np.exp(log_std)
-        variance = np.maximum(white**2 + (gain * charge) ** 2, smallest_number)
-        # For a normal distribution, the term of a residual is its squared deviation. Beyond the limit, the term only
-        # increases with the logarithm of the squared deviation.
+        variance = np.maximum(white**2 + (gain * charge) ** 2, smallest_positive)
+        # For a normal distribution, the term of a residual is its squared deviation. Beyond `square_limit`, a residual
+        # is an outlier, and the term only increases with the logarithm of the squared deviation.
         squared_deviation = residual**2 / variance
         normal_term = np.minimum(squared_deviation, square_limit)
         tail_term = square_limit * np.log(np.maximum(squared_deviation / square_limit, 1.0))  # 0 up to the limit

@@ -102,35 +102,39 @@ def fit_charge_series(
     unit_contact = domain.to_unit(presses.contact)
     if presses.has_nonpositive_charges:
         # The series describes Q / S, where Q is a charge, and S is the typical size of charges at the same force. For
-        # charges near zero, errors relative to Q would be too large, so the unit of an error does not decrease below
-        # the charge at which the white noise equals the noise that is proportional to the charge.
+        # charges near zero, errors relative to Q would be too large. The unit of an error therefore does not decrease
+        # below white_pC / gain. At this charge, the white noise equals the noise that is proportional to the charge.
         candidate_degrees = SIGNED_CANDIDATE_DEGREES
-        log_size = _fit_log_size(unit_contact[:, 2], presses.charge)
-        size, _ = series_size(log_size, unit_contact[:, 2])  # S, shape (n, 1), pC
-        target = presses.charge / size
+        size_coefficients = _fit_log_size(unit_contact[:, 2], presses.charge)  # of ln S as a polynomial
+        charge_size, _ = series_size(size_coefficients, unit_contact[:, 2])  # S, shape (n, 1), pC
+        target = presses.charge / charge_size
         error_unit = np.hypot(validation.charge, white_pC / REFERENCE_NOISE.gain)
     else:
         candidate_degrees = CANDIDATE_DEGREES
-        log_size = None
+        size_coefficients = None
         target = np.log(presses.charge)  # the series describes ln Q
         error_unit = validation.charge
 
     # Try the degrees until the error is small enough, or the presses are too few for the next degrees.
+    # The first degree is the total degree in x and y, and the second is the degree in the logarithm of the force.
     best_series: ChargeSeries | None = None
     for degree, largest_force_degree in candidate_degrees:
         force_degree = determined_degree(unit_contact[:, 2], largest_force_degree)
-        fewest = MIN_PRESSES_PER_TERM * series_term_count(degree, force_degree)
-        if fewest > len(presses):
+        min_press_count = MIN_PRESSES_PER_TERM * series_term_count(degree, force_degree)
+        if min_press_count > len(presses):
             break
+        # [None] adds the axis of the nodes, which are the pretensions of a series. This series has only one.
         coefficients = fit_series(unit_contact, target, degree, force_degree)[None]
-        series = ChargeSeries(domain=domain, electrodes=electrodes, coefficients=coefficients, log_size=log_size)
+        series = ChargeSeries(
+            domain=domain, electrodes=electrodes, coefficients=coefficients, log_size=size_coefficients
+        )
         error = rms((series.charges(validation.contact) - validation.charge) / error_unit)
         if best_series is None or error < best_series.charge_std:
             best_series = replace(series, charge_std=error)
         if error < SUFFICIENT_ERROR:
             break
     if best_series is None:  # the presses are too few for the first degrees
-        raise TrainingError(f"expected at least {fewest} presses to fit the charges by, got {len(presses)}")
+        raise TrainingError(f"expected at least {min_press_count} presses to fit the charges by, got {len(presses)}")
     return best_series
 
 
@@ -154,12 +158,12 @@ def fit_film_series(
     """
     # The fit treats the electrodes of all nodes as electrodes of one film.
     presses = LabelledPresses(contact, node_charge.reshape(len(contact), -1))
-    names = electrodes * node_MPa.size
+    names = electrodes * node_MPa.size  # all names are repeated for each node
     is_validation = np.arange(len(contact)) % 10 == 0
     all_nodes = fit_charge_series(domain, names, presses[~is_validation], presses[is_validation])
 
     # The coefficients have an axis for each of the three degrees, and one for the electrodes of all nodes. Divide the
-    # last axis into nodes and electrodes, and make the nodes the first axis.
+    # last axis into nodes (axis 3) and electrodes, and make the nodes the first axis.
     (joined,) = all_nodes.coefficients
     *degrees, _ = joined.shape
     by_degree = joined.reshape(*degrees, node_MPa.size, len(electrodes))
@@ -240,7 +244,8 @@ def fit_series(unit_contact: Array, target: Array, degree: int, force_degree: in
         right_side += chunk_of_a.T @ target[rows]
 
     # The series also has entries for terms above the total degree, whose coefficients remain zero. The axes of the
-    # solution become the term in the position, the degree in the force, and the value.
+    # solution become the term in the position, the degree in the force, and the value. `position_degrees` returns the
+    # degree in x and the degree in y of each term in the position, which are its indices in the series.
     solution = cho_solve(cho_factor(normal_matrix), right_side)
     series = np.zeros((degree + 1, degree + 1, force_degree + 1, target.shape[1]))
     series[position_degrees(degree)] = solution.reshape(n_term // (force_degree + 1), force_degree + 1, -1)

@@ -68,6 +68,7 @@ class PressedArea(Domain):
             max_force *= MIN_FORCE_RATIO**0.5
         distance_from_middle = np.linalg.norm(corners - box_middle(corners), axis=1)
         corner_places = tuple((x, y) for x, y in corners.tolist())
+        # The first argument is the attribute `radius`, the distance of the farthest corner from the middle.
         return cls(float(distance_from_middle.max()), (min_force, max_force), corner_places)
 
     @cached_property
@@ -119,6 +120,8 @@ def outline(places: Array) -> Array:
     # The nearest place is the place itself, and the second nearest is its nearest neighbour.
     distances, _ = cKDTree(places).query(places, 2)
     spacing = np.median(distances[:, 1])
+    # `HULL_RATIO` determines how far the hull is bent inwards between places. `simplify(0.0)` removes corners on
+    # straight edges.
     exterior = shapely.concave_hull(shapely.MultiPoint(places), HULL_RATIO).simplify(0.0)
     enlarged = exterior.buffer(0.5 * spacing, join_style="mitre", mitre_limit=2.0)
     # The corners are clockwise, and the last corner repeats the first. Reverse them, and leave out the repeated corner.
@@ -147,7 +150,7 @@ def check_measured_presses(presses: MeasuredPresses) -> None:
     for name in (*CONTACT, *presses.electrodes):
         values = presses.columns[name]
         _check_far_value(presses, name, values, compared_values=values)
-    for name in presses.electrodes:
+    for name in presses.electrodes:  # the charges must vary, and must not be in ascending order
         _check_variation(name, presses.columns[name])
 
     # A force that is far too small is not far from the other forces, but its inverse is far from the other inverses.
@@ -168,8 +171,8 @@ def _check_variation(name: str, charge: Array) -> None:
         charge: Charges of the channel, shape (n,), pC.
 
     Raises:
-        PressError: If all charges are in ascending order, or if all charges are equal except for the shares
-            `EXTREME_SHARE` of the smallest and of the largest charges.
+        PressError: If all charges are in ascending order, or if all charges are equal after the smallest and the
+            largest charges are left out, each a share `EXTREME_SHARE` of all.
     """
     low, high = np.quantile(charge, (EXTREME_SHARE, 1.0 - EXTREME_SHARE))
     if np.isclose(low, high, atol=0.0):
@@ -196,7 +199,7 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
         name: Name of the column, for the message.
         values: Values of the column, shape (n,).
         compared_values: Numbers whose distances from their median are compared, shape (n,). They are the values or a
-            function of the values.
+            function of the values, such as their inverses, which shows values that are far too small.
 
     Raises:
         PressError: If the largest distance exceeds `MAX_DISTANCE_RATIO` times the usual distance.
@@ -206,7 +209,7 @@ def _check_far_value(presses: MeasuredPresses, name: str, values: Array, compare
         return
     # Distances of zero are left out, because the usual distance would otherwise be zero if most values are equal.
     usual_distance = np.quantile(distance[distance > 0.0], USUAL_DISTANCE_QUANTILE)
-    row = distance.argmax()
+    row = distance.argmax()  # row of the farthest value
     if distance[row] > MAX_DISTANCE_RATIO * usual_distance:
         raise PressError(
             f"line {presses.lines[row]}, column {shown(name)}: expected a value of the size of the others, whose "
@@ -226,12 +229,13 @@ def _check_independence(presses: MeasuredPresses) -> None:
     """
     charge = presses.charge_pC
     standardised_charge = (charge - charge.mean(axis=0)) / charge.std(axis=0)
+    # Each row of `directions` contains the coefficients of one combination of the channels. The last row belongs to the
+    # smallest singular value.
     _, singular_values, directions = np.linalg.svd(standardised_charge, full_matrices=False)
     largest, *_, smallest = singular_values
     if smallest > MIN_INDEPENDENCE * largest:
         return
-    # The last singular vector, a unit vector, contains the coefficients of a combination of the channels that is nearly
-    # zero.
+    # The last combination is nearly zero. Its coefficients form a unit vector.
     dependent_names = [
         shown(name)
         for name, coefficient in zip(presses.electrodes, directions[-1], strict=True)

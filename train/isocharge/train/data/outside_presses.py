@@ -48,13 +48,12 @@ class OutsidePresses:
     def of(
         cls, domain: Domain, presses: LabelledPresses, outside: LabelledPresses | None = None, seed: int = 0
     ) -> "OutsidePresses | None":
-        """Collect the presses outside a working area.
+        """Collect the presses outside a working area, and divide them into presses for training and for measuring.
 
         Args:
             domain: Working area and range of forces of the network.
-            presses: Presses of the area for which a network was requested. The working area is smaller than this area
-                if the map from contacts to charges folds beyond the working area. The presses beyond the working area
-                are then used.
+            presses: Presses of the area for which a network was requested. Only those beyond the working area are used.
+                There are some if the working area is smaller than the requested area.
             outside: Presses farther from the centre than all of `presses`; None if there are none.
             seed: Seed of the random choice of the presses for training and of the presses for measuring.
 
@@ -62,16 +61,18 @@ class OutsidePresses:
             The presses; None if fewer than `N_NEIGHBOURS` presses for measuring have a large enough force.
         """
         # Collect all presses outside, and divide them into two random halves.
-        pool = presses[presses.distance > domain.radius]
+        all_outside = presses[presses.distance > domain.radius]
         if outside is not None:
-            contact = np.concatenate([pool.contact, outside.contact])
-            pool = LabelledPresses(contact, np.concatenate([pool.charge, outside.charge]))
-        shuffled = pool[np.random.default_rng(seed).permutation(len(pool))]
+            contact = np.concatenate([all_outside.contact, outside.contact])
+            all_outside = LabelledPresses(contact, np.concatenate([all_outside.charge, outside.charge]))
+        shuffled = all_outside[np.random.default_rng(seed).permutation(len(all_outside))]
         half_count = len(shuffled) // 2
         train = shuffled[:half_count]
         second_half = shuffled[half_count:]
 
-        # The share of wrong answers without a flag is measured without very weak presses.
+        # The share of wrong answers without a flag is measured without presses that are more than `FORCE_RATIO` times
+        # weaker than the largest force. Each share is computed from `N_NEIGHBOURS` presses, so at least as many are
+        # needed.
         _, max_force = domain.force_range
         test = second_half[second_half.contact[:, 2] >= max_force / FORCE_RATIO]
         if len(test) < N_NEIGHBOURS:
@@ -84,8 +85,8 @@ class OutsidePresses:
         Args:
             is_unnoticed: Whether the answer to each press of `test` is wrong and carries no flag, shape (n,).
         """
-        # The area is divided into `N_SECTORS` rings of as many sectors. The share of a sector is that of the presses
-        # nearest to its middle.
+        # The area is divided into `N_SECTORS` rings of as many sectors. The share of a sector is that of the
+        # `N_NEIGHBOURS` presses nearest to its middle.
         sector_middles = Rings.between(self.domain.radius, self.outer, rings=N_SECTORS, sectors=N_SECTORS)
         _, nearest_presses = cKDTree(self.test.contact[:, :2]).query(sector_middles.position, N_NEIGHBOURS)
         shares = is_unnoticed[nearest_presses].mean(axis=-1).round(2)  # shape (ring, sector)

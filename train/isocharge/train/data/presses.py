@@ -146,7 +146,7 @@ def domain_of(dataset: Dataset) -> Domain:
     domain = Domain(ranges.radius_mm, ranges.force_N)
     presses = LabelledPresses.of(dataset.samples)
     if not domain.contains(presses.contact).all():
-        needed = presses.domain
+        needed = presses.domain  # smallest domain that contains the samples
         min_force, max_force = needed.force_range
         raise DatasetError(
             f"manifest ranges: radius_mm {domain.radius:g} and force_N {domain.force_range} do not hold the samples, "
@@ -190,7 +190,7 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
     grid_mm = 0.25 * step_mm
     cells, cell_of_press = np.unique(np.round(position / grid_mm), axis=0, return_inverse=True)
 
-    # Connect cells whose distance is at most a step. The connected cells form a place.
+    # Connect cells whose distance is at most a step. Cells that are connected by a chain of such steps form a place.
     pairs = cKDTree(cells * grid_mm).query_pairs(step_mm, output_type="ndarray")
     steps = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cells), len(cells)))
     _, place_of_cell = connected_components(steps, directed=False)
@@ -198,7 +198,7 @@ def merged_places(contact: Array, step_mm: float = PLACE_STEP_mm) -> Array:
 
     def mean_of_place(values: Array) -> Array:
         """Return for each press the mean of the values, shape (n,), over all presses at its place."""
-        means = np.bincount(place_of_press, values) / np.bincount(place_of_press)  # one for each place
+        means = np.bincount(place_of_press, values) / np.bincount(place_of_press)  # sum / count, one for each place
         return np.asarray(means[place_of_press])
 
     # Keep the original positions of places that are too large.
@@ -239,8 +239,8 @@ def presses_of(dataset: Dataset, fewest: int = MIN_PRESSES) -> LabelledPresses:
         Contacts and charges of the presses.
 
     Raises:
-        DatasetError: If the dataset has too few presses, positions or electrodes, or if the charge of an electrode
-            never varies.
+        DatasetError: If the dataset has too few presses, fewer than `MIN_PLACES` positions or three electrodes, or if
+            the charge of an electrode never varies.
     """
     presses = LabelledPresses.of(dataset.samples)
     n_position = place_count(presses.contact)
@@ -283,7 +283,8 @@ def dataset_of(presses: MeasuredPresses, sensor: Sensor, probe: Probe) -> Datase
     check_enough(count, len(presses), sensor.name)
     x_mm, y_mm, force_N = merged_places(complete_presses.contact).T
     probe_column = np.full(count, probe.notation)
-    orientation_deg = np.full(count, np.rad2deg(probe.angle) % 360.0)  # its notation does not contain its rotation
+    # The notation of the probe does not contain its rotation, so the rotation has a column of its own, 0 to 360 deg.
+    orientation_deg = np.full(count, np.rad2deg(probe.angle) % 360.0)
     samples = Samples(x_mm, y_mm, force_N, probe_column, orientation_deg, complete_presses.charge_pC)
     sha256 = presses_sha256(complete_presses)
     return Dataset(sensor, samples, manifest={}, sha256=sha256)  # measured presses have no settings of a simulator
