@@ -136,7 +136,8 @@ def _refuse_options(context: typer.Context, source: str, *used_options: str) -> 
     Args:
         context: The command with its arguments.
         source: Description of the presses, for the error message.
-        *used_options: Parameters of the command that have an effect on the presses.
+        *used_options: Parameters of the command that have an effect on the presses. All other parameters that describe
+            presses are refused.
 
     Raises:
         InputError: If an option without an effect is given.
@@ -181,11 +182,12 @@ def _release(fitted: Fitted, model_folder: Path, version: int) -> Release:
         IsochargeError: If the version cannot be written to the folder of the model. The message names the temporary
             folder.
     """
-    write = partial(release, fitted, version=version, command=this_command())
+    write = partial(release, fitted, version=version, command=this_command())  # takes the folder of the model
     try:
         return write(model_folder)
     except (OutputExists, OutputError, ModelError) as error:
         temporary = write(Path(mkdtemp(prefix="isocharge-"), model_folder.resolve().name))
+        # Raise an error of the same class with a longer message.
         raise type(error)(f"{error}. The trained model is kept in {temporary.folder}") from error
 
 
@@ -195,12 +197,12 @@ def _fit_simulated_presses(sensor: Sensor, notations: Sequence[str], radius: str
     Args:
         sensor: The sensor.
         notations: Notations of the probes.
-        radius: Largest distance of a press from the centre: a number of mm, or "auto".
+        radius: Largest distance of a press from the centre: a text with a number of mm, or "auto".
         config: Training settings.
     """
     probes = [parse_probe(notation) for notation in notations]
     warn_of_stress(sensor.film, probes, DEFAULT_FORCE_RANGE[1])
-    noise = misfit_noise(config.training.noise_model)
+    noise = misfit_noise(config.training.noise_model)  # for the radius "auto", which is that of the working area
     with solving_executor(sensor.film) as executor:
         radius_mm = sweep_radius(radius, sensor, probes, DEFAULT_FORCE_RANGE, executor, noise)
         dataset = simulated_presses(sensor, probes, radius_mm, executor)

@@ -172,7 +172,7 @@ def _read_earlier_session(path: Path, electrodes: tuple[str, ...], stds: dict[st
     """
     if path.is_file():
         presses = read_presses(path, electrodes, **stds)
-        if presses.ignored:
+        if presses.ignored:  # names of columns that were not read
             raise PressError(
                 f"{path}: expected a file of `isocharge train press`, got further columns: "
                 f"{', '.join(presses.ignored)}; they would be lost, so choose another output"

@@ -39,20 +39,25 @@ class PressEvents:
     ) -> None:
         """Start the threads that read the port and the keyboard.
 
+        The threads put readings and typed lines into one queue. The method `next` takes them from the queue.
+
         Args:
             chunks: Iterable over the bytes of an open port.
             stream: Decoder of the bytes.
-            watch: Detector of steady presses.
+            watch: Detector of steady presses, to which the method `next` passes the readings.
             keyboard: File descriptor of the keyboard; None for no keyboard.
         """
         self._watch = watch
-        self._queue: Queue[Frame | str | Exception | None] = Queue()  # None stands for a call of the method `arm`
-        self._waiting_arms = 0  # number of calls of `arm` that are still in the queue
+        # The queue contains readings, typed lines, the error with which a thread ends, and None for a call of `arm`.
+        # The method `arm` makes the watch wait for a new press.
+        self._queue: Queue[Frame | str | Exception | None] = Queue()
+        self._queued_arm_calls = 0  # number of calls of `arm` that are still in the queue
         self._stop = threading.Event()
         self._port_thread = self._start_reading(_frames(chunks, stream))
         if keyboard is not None:
             # The file is not buffered, because a buffer would hold a lock when the program ends.
             lines = FileIO(keyboard, closefd=False)
+            # The method `close` does not wait for this thread, which may wait for a typed line for ever.
             self._start_reading(line.decode(errors="replace") for line in lines)
 
     def close(self) -> None:
@@ -62,14 +67,14 @@ class PressEvents:
 
     def arm(self) -> None:
         """Discard all earlier readings, and detect only presses that begin after this call."""
-        self._waiting_arms += 1
+        self._queued_arm_calls += 1
         self._queue.put(None)
 
     def next(self) -> WatchResult | str:
         """Wait for the next reading or typed line.
 
-        After a call of the method `arm`, only presses that begin later count. Readings that were made before the last
-        call of `arm` are passed to the detector of steady presses, but are not returned.
+        The method `arm` makes the watch, which detects steady presses, wait for a new press. Readings that were made
+        before the last call of `arm` are passed to the watch, but are not returned.
 
         Returns:
             Result of the watch for a reading, or the typed line.
@@ -79,26 +84,26 @@ class PressEvents:
             IsochargeError: If the port fails.
         """
         while True:
-            event = self._queue.get()
+            event = self._queue.get()  # the error of a thread, a typed line, a call of `arm`, or a reading
             if isinstance(event, Exception):
                 raise event
             if isinstance(event, str):
                 return event
-            if event is None:  # a call of `arm`
+            if event is None:  # stands for a call of `arm`
                 self._watch.arm()
-                self._waiting_arms -= 1
+                self._queued_arm_calls -= 1
                 continue
             watched = self._watch.feed(event)
-            if not self._waiting_arms:  # otherwise, the reading is older than the last call of `arm`
+            if not self._queued_arm_calls:  # otherwise, the reading is older than the last call of `arm`
                 return watched
 
     def _start_reading(self, items: Iterable[Frame | str]) -> threading.Thread:
         """Start a thread that puts readings or typed lines into the queue, and return the thread."""
-        thread = threading.Thread(target=self._read, args=[items], daemon=True)
+        thread = threading.Thread(target=self._fill_queue, args=[items], daemon=True)
         thread.start()
         return thread
 
-    def _read(self, items: Iterable[Frame | str]) -> None:
+    def _fill_queue(self, items: Iterable[Frame | str]) -> None:
         """Put readings or typed lines into the queue until they end.
 
         The method runs in its own thread. An error is put into the queue, too. The method `next` raises the error again
@@ -177,26 +182,27 @@ class Dialogue:
         """Record the presses that a machine makes, in the order of its list.
 
         Args:
-            contacts: Presses (x, y, F) of the list, shape (n, 3), mm and N; unknown values are NaN. The presses in the
-                rows up to the last press of the session were made earlier, and are not expected again.
+            contacts: Presses (x, y, F) of the list, shape (n, 3), mm and N; unknown values are NaN. If the session
+                continues an earlier session, the rows up to its last recorded press are skipped.
 
         Raises:
             PortLost: If the port is lost, because it is then unknown which press comes next.
             InputError: If the port ends before the last press.
         """
-        # Find the presses of an earlier session in the list, one after the other. Rows between them were left out.
-        finished_count = 0  # number of rows of the list up to the last recorded press
+        # The session may already contain presses of an earlier session. Find them in the list, one after the other, so
+        # that the machine continues below the last of them. Rows between them were left out earlier.
+        next_row = 0  # index of the row below the recorded presses that are found so far
         for recorded in self._session.presses.contact:
-            is_recorded_row = np.isclose(contacts[finished_count:], recorded, equal_nan=True).all(axis=1)
-            if is_recorded_row.any():
-                finished_count += is_recorded_row.argmax() + 1
+            is_same_press = np.isclose(contacts[next_row:], recorded, equal_nan=True).all(axis=1)
+            if is_same_press.any():
+                next_row += is_same_press.argmax() + 1  # argmax finds the first row with this press
         try:
             # A press before the tare would be lost, and each later press would be assigned to the wrong row.
             self._wait_for(Phase.waiting)
-            say(f"The tare is measured. Let the machine begin with row {finished_count + 1} of its list.")
-            for row_number, contact in enumerate(contacts[finished_count:], finished_count + 1):
+            say(f"The tare is measured. Let the machine begin with row {next_row + 1} of its list.")
+            for row_number, contact in enumerate(contacts[next_row:], next_row + 1):
                 say(f"{row_number}. {describe_press(contact)}")
-                self._shown_phase = ""
+                self._shown_phase = ""  # print the instruction of each phase again for this press
                 event = self._wait_for(Phase.taken, Phase.refused)
                 if event.press is not None:
                     self._say_steady(event.press)
@@ -239,7 +245,7 @@ class Dialogue:
         proposed = self._session.proposed
         steady_press: SteadyPress | None = None  # the press about which a question is open; None without a question
         say(f"{len(self._session) + 1}. Press {describe_press(proposed.contact)} and hold.")
-        self._shown_phase = ""
+        self._shown_phase = ""  # print the instruction of each phase again for this press
         self._events.arm()  # only presses from now on count
 
         # A command that removes an earlier press changes the proposal of the session. The loop then ends, so that the
@@ -248,7 +254,7 @@ class Dialogue:
             event = self._events.next()
             if isinstance(event, str):  # a typed line: an answer or a command
                 is_settled = self._handle_line(event, steady_press, proposed.contact)
-                if is_settled:
+                if is_settled:  # the press was recorded or discarded
                     return
             elif steady_press is not None:
                 continue  # readings do not matter while the question is open
@@ -275,7 +281,8 @@ class Dialogue:
             proposed: The proposed press (x, y, F), shape (3,), mm and N.
 
         Returns:
-            Whether the proposal is settled. If so, the next press must be proposed.
+            True if the press about which a question was open was recorded or discarded. The next press must then be
+            proposed. Otherwise False, also after the removal of an earlier press.
 
         Raises:
             SessionEnd: If the command is to quit.
@@ -289,14 +296,15 @@ class Dialogue:
             if answer.reply == "take":
                 say("   press first: the question comes when the press is steady")
                 return False
-            if press is not None:
+            # The remaining command is to remove a press.
+            if press is not None:  # a question is open, and its answer discards the press
                 say("   this press is not taken")
                 return True
-            say(f"   press {self._session.undo()} is removed")
+            say(f"   press {self._session.undo()} is removed")  # the press that was recorded last
             self._say_summary()
         except PressError as error:
             say(f"   {error}")
-        return False  # an open question remains open; the caller notices whether the proposal has changed
+        return False  # an open question remains open; the caller checks whether the session proposes another press
 
     def _take(self, press: SteadyPress, contact: Array) -> bool:
         """Record a press in the session, and return whether the session accepts it.
