@@ -24,16 +24,18 @@ log = logging.getLogger(__name__)
 def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: bool = False) -> str:
     """Return the text of `isocharge_device.h`, which defines the settings of the signal chain as macros.
 
-    A stage of the signal chain belongs to a section of a device file. The C sources implement only some of the stages.
-    The macro `ISOCHARGE_<SECTION>_ON` of an implemented stage is 1 if the stage is switched on. The other macros of the
-    stage have the names of its settings in capital letters. The device file may also switch on a stage that is not
-    implemented in C. If such a stage only processes contacts, it is left out with a warning, because a host can process
-    the contacts as well. Any other such stage is an error, because the charges would be wrong.
+    A stage of the signal chain belongs to a section of a device file. A stage without a section has no settings and no
+    macros. The C sources implement only some of the stages. The macro `ISOCHARGE_<SECTION>_ON` of an implemented stage
+    is 1 if the stage is switched on. The other macros of the stage have the names of its settings in capital letters.
+
+    The device file may also switch on a stage that is not implemented in C. If such a stage only processes contacts, it
+    is left out with a warning, because a host can process the contacts as well. Any other such stage is an error,
+    because the charges would be wrong.
 
     Args:
         device: The board.
         electrodes: Names of the electrodes in the order of the model.
-        has_any_sign: Whether the charges of a touch may have any sign.
+        has_any_sign: Whether the charges of a touch may have any sign. Otherwise, most of them are positive.
 
     Raises:
         DeviceError: If the device file is for other electrodes, if its tare is too long for C, or if it uses a stage
@@ -48,11 +50,11 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     for stage in STAGES:
         is_on = stage.rule_class in device.rules
         prefix = f"ISOCHARGE_{stage.section.upper()}_"
-        is_in_c = prefix in chain_source  # the C source of a stage uses its macros
+        is_in_c = prefix in chain_source  # the C source of an implemented stage uses its macros
         if is_in_c:
             settings = {"on": is_on, **stage.c_settings(setup)}
             macros |= {prefix + name.upper(): _c_literal(value) for name, value in settings.items()}
-        elif stage.section and is_on:  # the device file switches the stage on
+        elif stage.section and is_on:  # the device file switches on a stage that is not implemented in C
             if not stage.needs_contact:
                 raise DeviceError(f"{device.where}: {stage.section}: {NOT_IN_C}")
             host_sections.append(stage.section)
@@ -76,7 +78,8 @@ def settings_origin(device: Device) -> str:
 def _c_literal(value: Any) -> str:
     """Return a number or a truth value as a C literal, and an array as an initialiser.
 
-    A truth value becomes 0 or 1. The numbers of an array are converted to the precision of the signal chain.
+    A truth value becomes 0 or 1. The numbers of an array are converted to the precision of the signal chain: the C type
+    `isocharge_real` is `float` or `double`.
 
     Args:
         value: The number, truth value or array.

@@ -73,18 +73,19 @@ def layer_source(name: str, weight: Array, bias: Array | None = None, activation
         activation: Name of the C function f; empty for the identity.
     """
     n_input, n_output = weight.shape
+    # The values are integers with a scale for each output, or the unchanged weights without a scale (None).
     values, scale = round_to_int8(weight.astype(np.float32))
     arrays = [c_array(f"{name}_weights", values)]
 
     # C expression for output j. At first, y[j] contains the sum of the products for this output. If the weights are
     # integers, the sum is multiplied by the scale of its column.
-    result = "y[j]"
+    output_expression = "y[j]"
     if scale is not None:
         arrays.append(c_array(f"{name}_scale", scale))
-        result += f" * {name}_scale[j]"
+        output_expression += f" * {name}_scale[j]"
     if bias is not None:
         arrays.append(c_array(f"{name}_bias", bias))
-        result += f" + {name}_bias[j]"
+        output_expression += f" + {name}_bias[j]"
     return source_text(
         "layer.c",
         name=name,
@@ -93,14 +94,15 @@ def layer_source(name: str, weight: Array, bias: Array | None = None, activation
         n_input=n_input,
         n_grouped=n_input - n_input % 4,  # inputs that are processed four at a time
         n_output=n_output,
-        result=f"{activation}({result})",
+        output_expression=f"{activation}({output_expression})",
     )
 
 
 def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     """Convert weights to 8-bit integers if the weights of each column are multiples of one number, the scale.
 
-    The scale of a column is its largest absolute weight divided by `LARGEST_INT8`.
+    The scale of a column is its largest absolute weight divided by `LARGEST_INT8`. If the training
+    has rounded the weights, they are multiples of the scale. This function does not round other weights.
 
     Args:
         values: Weights, shape (inputs, outputs).
@@ -111,7 +113,7 @@ def round_to_int8(values: Singles) -> tuple[NDArray[Any], Singles | None]:
     """
     scale = np.abs(values).max(axis=0) / np.float32(LARGEST_INT8)
     nonzero_scale = np.where(scale > 0.0, scale, 1.0)  # a column of zeros has the scale 0
-    multiples = np.round(values / nonzero_scale)
+    multiples = np.round(values / nonzero_scale)  # whole numbers, even if the division rounds
     if np.allclose(multiples * scale, values, atol=0.0):
         return multiples.astype(np.int8), scale
     return values, None
@@ -128,21 +130,23 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         metadata: Metadata of the model.
         network: The network of the model.
     """
+    # The template of the file contains a placeholder for each of the arguments of `source_text`.
     features = network.features
-    is_logarithmic = features.mean is None
+    is_logarithmic = features.mean is None  # only features of charges of both signs have a mean
     validity = Validity.of(metadata)
     min_force_N, max_force_N = validity.force_range_N
     centre_x_mm, centre_y_mm = validity.centre_mm
+    # Beyond these limits, an answer of the model cannot be a measurement.
     squared_distance_mm2, implausible_force_N = validity.implausible_limits
     return source_text(
         "isocharge_model.h",
-        label=c_comment(metadata.label),
-        model=c_string(metadata.label),
+        label_comment=c_comment(metadata.label),
+        label_string=c_string(metadata.label),
         sensor=c_string(metadata.frame_id),
-        electrodes=len(metadata.electrodes),
-        names=", ".join(map(c_string, metadata.electrodes)),
-        fields=", ".join(f'"{name}"' for name in Contact._fields),
-        numbers=len(Contact._fields),
+        electrode_count=len(metadata.electrodes),
+        electrode_names=", ".join(map(c_string, metadata.electrodes)),
+        field_names=", ".join(f'"{name}"' for name in Contact._fields),
+        field_count=len(Contact._fields),
         corner_count=len(validity.corners_mm),
         corners=c_numbers(validity.corners_mm),
         min_force=c_float(min_force_N),
@@ -153,6 +157,7 @@ def model_header(metadata: ModelMetadata, network: FoldedNetwork) -> str:
         centre_y=c_float(centre_y_mm),
         beyond_mm=c_float(math.sqrt(squared_distance_mm2)),
         beyond_N=c_float(implausible_force_N),
+        # A comment in the file states the limits of the charges. Limits for each electrode are the arrays LOW and HIGH.
         low=f"{features.low_pC:g}" if is_logarithmic else "LOW",
         high=f"{features.high_pC:g}" if is_logarithmic else "HIGH (isocharge_model.c)",
     )
@@ -193,7 +198,8 @@ def _perceptron_source(name: str, perceptron: Perceptron, features: ChargeFeatur
 
     The first hidden layer and the skip layer read the features from `logs`. The hidden layers write alternately to two
     rows of a buffer, and each layer reads the row that the layer before it wrote. If the features are logarithms, the
-    weights of the first layer and of the skip layer are changed by `_convert_to_differences`.
+    weights of the first layer and of the skip layer are changed by `_convert_to_differences`. Otherwise, the array
+    `logs` contains inverse hyperbolic sines.
 
     Args:
         name: Beginning of the names of the C functions.
@@ -202,7 +208,7 @@ def _perceptron_source(name: str, perceptron: Perceptron, features: ChargeFeatur
     """
     (first_weight, first_bias), *later = perceptron.hidden
     skip_weight = perceptron.skip
-    if features.mean is None:
+    if features.mean is None:  # logarithms of positive charges
         first_weight = _convert_to_differences(first_weight)
         skip_weight = _convert_to_differences(skip_weight)
 
@@ -232,23 +238,28 @@ def _perceptron_source(name: str, perceptron: Perceptron, features: ChargeFeatur
 def self_test(golden: Golden, metadata: ModelMetadata) -> str:
     """Return the text of `self_test.c`, which contains golden vectors, their tolerances and their flags.
 
+    The C program compares its own answers to the charges with the stored answers. It accepts differences up to
+    `relative` times the larger of two numbers: the magnitude of the stored number, and the floor of its column.
+
     Args:
-        golden: Golden vectors of the model.
+        golden: Golden vectors of the model, which are charges and the answers to them.
         metadata: Metadata of the model.
     """
     answers = np.concatenate([golden.outputs[name] for name in COLUMNS], axis=1).astype(np.float32)
     contacts = Contacts(*answers.T)  # one array for each column
-    flags = [sum(FLAG_BITS[flag] for flag in words) for words in Validity.of(metadata).batch_flags(contacts)]
+    flag_bits = [  # one integer for each answer, the sum of the bits of its flags
+        sum(FLAG_BITS[flag] for flag in answer_flags) for answer_flags in Validity.of(metadata).batch_flags(contacts)
+    ]
     floors = np.concatenate([golden.tolerance.floor[name] for name in COLUMNS])
     return source_text(
         "self_test.c",
-        vectors=len(answers),
-        numbers=answers.shape[1],
+        vector_count=len(answers),
+        number_count=answers.shape[1],
         relative=c_float(golden.tolerance.relative),
         floors=c_array("FLOOR", floors),
         charges=c_array("CHARGE_PC", golden.charge_pC),
         contacts=c_array("CONTACT", answers),
-        flags=c_array("FLAGS", np.array(flags, np.uint32)),
+        flags=c_array("FLAGS", np.array(flag_bits, np.uint32)),
     )
 
 
@@ -260,7 +271,7 @@ def _features_source(features: ChargeFeatures) -> str:
     """
     arrays = {"FACTOR": 1.0 / features.typical_pC, "LOW": features.low_pC, "HIGH": features.high_pC}
     template = "features.c"
-    if features.mean is not None:
+    if features.mean is not None:  # the charges may have both signs
         arrays["MEAN"] = features.mean
         template = "features_signed.c"
     n_electrode = features.n_electrode

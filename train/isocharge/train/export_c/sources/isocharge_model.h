@@ -1,4 +1,4 @@
-/* $label: charges of a film to where and how hard it is touched. Written by isocharge train export-c. */
+/* $label_comment: charges of a film to where and how hard it is touched. Written by isocharge train export-c. */
 #ifndef ISOCHARGE_MODEL_H
 #define ISOCHARGE_MODEL_H
 
@@ -8,12 +8,12 @@
 extern "C" {
 #endif
 
-#define ISOCHARGE_MODEL $model
+#define ISOCHARGE_MODEL $label_string
 #define ISOCHARGE_SENSOR $sensor
-#define ISOCHARGE_ELECTRODES $electrodes
-#define ISOCHARGE_ELECTRODE_NAMES {$names}
-#define ISOCHARGE_CONTACT_FIELDS {$fields}
-#define ISOCHARGE_CONTACT_NUMBERS $numbers
+#define ISOCHARGE_ELECTRODES $electrode_count
+#define ISOCHARGE_ELECTRODE_NAMES {$electrode_names}
+#define ISOCHARGE_CONTACT_FIELDS {$field_names}
+#define ISOCHARGE_CONTACT_NUMBERS $field_count
 
 /* What the model was trained for: the corners x, y of the working area in mm, the range of forces, the largest misfit of
    a single contact, and the force above which the film yields. */

@@ -19,5 +19,5 @@ static void $name(const float *restrict x, float *restrict y)
             y[j] += x[i] * (float)w[j];
     }
     for (int j = 0; j < $n_output; ++j)
-        y[j] = $result;
+        y[j] = $output_expression;
 }

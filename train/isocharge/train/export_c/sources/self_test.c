@@ -4,7 +4,7 @@
 #include <math.h>
 #include <stdio.h>
 
-#define VECTORS $vectors
+#define VECTORS $vector_count
 #define RELATIVE $relative
 
 /* |a - b| <= RELATIVE max(|b|, FLOOR) */
@@ -15,13 +15,13 @@ $flags
 int main(void)
 {
     static const char *const field[] = ISOCHARGE_CONTACT_FIELDS;
-    float contact[$numbers], worst = 0.0f;
+    float contact[$number_count], worst = 0.0f;
     int row, column, wrong = 0;
 
     for (row = 0; row < VECTORS; ++row) {
         isocharge_predict_all(CHARGE_PC + row * ISOCHARGE_ELECTRODES, contact);
-        for (column = 0; column < $numbers; ++column) {
-            const float expected = CONTACT[row * $numbers + column];
+        for (column = 0; column < $number_count; ++column) {
+            const float expected = CONTACT[row * $number_count + column];
             const float apart = fabsf(contact[column] - expected) / fmaxf(fabsf(expected), FLOOR[column]);
 
             if (!(apart <= RELATIVE)) {
@@ -31,9 +31,9 @@ int main(void)
             }
             worst = apart > worst ? apart : worst;
         }
-        if (isocharge_flags(CONTACT + row * $numbers) != FLAGS[row]) {
+        if (isocharge_flags(CONTACT + row * $number_count) != FLAGS[row]) {
             printf("vector %d: flags: expected %u, got %u\n", row, FLAGS[row],
-                   isocharge_flags(CONTACT + row * $numbers));
+                   isocharge_flags(CONTACT + row * $number_count));
             ++wrong;
         }
     }
