@@ -54,9 +54,10 @@ def evaluate(fitted: Fitted) -> dict[str, float]:
     contact, std, misfit = fitted.cross_validated
     truth = fitted.test.contact
     errors = contact_errors(contact, std, truth)
-    if "constant_force" in fitted.made_with:
+    if "constant_force" in fitted.made_with:  # the network always returns the same force
         errors = {name: error for name, error in errors.items() if not name.startswith("force_")}
         errors |= _coverages(contact[:, :2], std[:, :2], truth[:, :2])
+    # `HELD_PRESSES` is the name of the entry with the number of presses.
     return {**errors, HELD_PRESSES: float(len(truth)), **_misfit_percentiles(misfit)}
 
 
@@ -66,7 +67,7 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise) -
     A fault counts as detected if the misfit is larger than the misfits of 99 % of good presses.
 
     Args:
-        predict: Function that computes the answers of the network.
+        predict: Function that computes contacts, standard deviations and misfits from charges.
         presses: Presses without noise.
         noise: Noise to add.
 
@@ -78,21 +79,22 @@ def simulated_errors(predict: Predict, presses: LabelledPresses, noise: Noise) -
     clean_contact, _, _ = predict(presses.charge)
     clean_median_mm, clean_p95_mm = np.percentile(position_error(clean_contact, presses.contact), [50, 95])
 
-    # Misfits of good presses, whose noise has the standard deviation 1 in units of the misfit
+    # Misfits of good presses. The misfit is a distance in standard deviations of `unit_noise`: the given noise, or the
+    # noise `reference` if the given noise is zero.
     unit_noise = misfit_noise(noise)
     _, _, misfits = predict(presses.repeated(N_GOOD_PRESSES).noisy(unit_noise, seed=1))
+    misfit_threshold = np.percentile(misfits, 99.0)  # for the detection of faults
 
     # Presses for the simulation of faults
     min_force, max_force = FORCES_NEAR_1_N
     force = presses.contact[:, 2]
     presses_near_1_N = presses[(force >= min_force) & (force <= max_force)]
-    threshold = np.percentile(misfits, 99.0)
     return {
         **contact_errors(contact, std, presses.contact),
         "clean_position_median_mm": rounded(clean_median_mm),
         "clean_position_p95_mm": rounded(clean_p95_mm),
         **_misfit_percentiles(misfits),
-        **_measure_detection(predict, presses_near_1_N, unit_noise, threshold),
+        **_measure_detection(predict, presses_near_1_N, unit_noise, misfit_threshold),
     }
 
 
@@ -131,7 +133,7 @@ def _measure_detection(
     """Simulate one faulty electrode at a time, and compute the fraction of presses whose misfits exceed a threshold.
 
     Args:
-        predict: Function that computes the answers of the network.
+        predict: Function that computes contacts, standard deviations and misfits from charges.
         presses: Presses without noise.
         noise: Noise to add.
         threshold: Misfit above which there is an alarm.
@@ -141,10 +143,16 @@ def _measure_detection(
     """
     if not len(presses):  # for example, if no force is near 1 N
         return {}
-    noisy_charge = presses.noisy(noise, seed=2)
+    noisy_charge = presses.noisy(noise, seed=2)  # other noise than that of the good presses
 
     def detected_fraction(*wrong_gains: float) -> float:
-        """Return the share of alarms over all presses, electrodes and gains, with one wrong electrode at a time."""
+        """Return the share of alarms over all presses, electrodes and gains, with one wrong electrode at a time.
+
+        An alarm is a misfit above `threshold`.
+
+        Args:
+            *wrong_gains: Factors, by one of which the charge of the wrong electrode is multiplied.
+        """
         faulty_charges = []
         for gain in wrong_gains:
             for electrode in range(noisy_charge.shape[1]):
@@ -177,7 +185,7 @@ def unnoticed_presses(fitted: Fitted, metadata: ModelMetadata) -> UnnoticedPress
     outside = fitted.outside
     if outside is None:
         return None
-    presses = outside.test
+    presses = outside.test  # without noise
     contact, std, misfit = fitted.predict(presses.noisy(misfit_noise(fitted.noise), seed=11))
     is_value_wrong = np.abs(contact - presses.contact) > WRONG_STDS * std  # for x, y and F, shape (n, 3)
     is_wrong = is_value_wrong.any(axis=1)

@@ -65,8 +65,8 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
 
     try:
         network = _recover_network(model.graph)
-        written = network.onnx_model()
-        is_equal = written.graph == model.graph and written.opset_import == model.opset_import
+        written_again = network.onnx_model()
+        is_equal = written_again.graph == model.graph and written_again.opset_import == model.opset_import
     except (LookupError, ValueError, StopIteration):  # the constants are too few, or their shapes do not fit a network
         is_equal = False
     if not is_equal:
@@ -77,7 +77,8 @@ def read_graph(onnx_model: bytes, where: str) -> FoldedNetwork:
 def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     """Return the network from which `write_graph` made a graph.
 
-    The constants have the order in which `FoldedNetwork.onnx_model` adds them. First come the constants of the
+    The graph contains the contact perceptron and the misfit perceptron joined into one perceptron, which is separated
+    again. The constants have the order in which `FoldedNetwork.onnx_model` adds them. First come the constants of the
     features, and then the constants of the hidden layers, the weights of the skip layer, and the bias and the weights
     of the last layer.
 
@@ -98,34 +99,36 @@ def _recover_network(graph: onnx.GraphProto) -> FoldedNetwork:
     constants = (np.asarray_chkfinite(numpy_helper.to_array(tensor), dtype=float) for tensor in graph.initializer)
     low_pC = next(constants)
     high_pC = next(constants)
-    typical_pC = 1.0 / next(constants)
+    typical_pC = 1.0 / next(constants)  # the graph contains the inverse, because it multiplies
     mean = next(constants) if is_signed else None
     features = ChargeFeatures(typical_pC, low_pC, high_pC, mean)
     hidden = [Layer(weight=next(constants), bias=next(constants)) for _ in range(n_hidden)]
     skip = next(constants)
     bias = next(constants)
     last = Layer(weight=next(constants), bias=bias)
-    # ONNX repeats a single number for all columns, but the C code does not, so such a bias is refused.
+    # ONNX repeats a single number for all columns, but the C code does not, so such a bias is refused. The last
+    # bias must also fit the columns of the skip layer.
     layers = (*hidden, last, Layer(skip, bias))
     has_biases = all(layer.bias.shape == layer.weight.shape[1:] for layer in layers)
     if not (hidden and has_biases):
         raise ValueError("expected hidden layers, and a bias for each column of the weights")
 
     # In each layer, the units of the contact perceptron come first, and those of the misfit perceptron follow. Find the
-    # index of the first unit of the misfit perceptron in each layer. In the last layer, the first units are the answers
-    # about the contact. For the layers before, use the weights of the next layer, from the last layer backwards. They
-    # have one row for each unit of the layer, and one column for each unit of the next layer. Only units of the misfit
-    # perceptron have weights for units of the misfit perceptron in the next layer.
-    misfit_starts = [ANGLES.stop]
+    # index of the first unit of the misfit perceptron in each layer, from the last layer backwards. In the last layer,
+    # the units are the answers. The angles are the last answers about the contact, so the misfit begins after them.
+    first_misfit_units = [ANGLES.stop]
+    # For a hidden layer, use the weights of the next layer. They have one row for each unit of the hidden layer, and a
+    # column for each unit of the next layer. Only units of the misfit perceptron have weights for units of the misfit
+    # perceptron in the next layer. `hidden[0]` is not the next layer of any hidden layer.
     for next_layer in (last, *reversed(hidden[1:])):
-        weights_for_misfit_units = next_layer.weight[:, misfit_starts[0] :]
+        weights_for_misfit_units = next_layer.weight[:, first_misfit_units[0] :]
         is_misfit_unit = weights_for_misfit_units.any(axis=1)
-        misfit_starts.insert(0, int(is_misfit_unit.argmax()))  # the first unit for which this is True
+        first_misfit_units.insert(0, int(is_misfit_unit.argmax()))  # argmax finds the first True
 
-    # Separate the two perceptrons.
+    # Separate the two perceptrons: the units before the first misfit unit of each layer, and the units from it on.
     joined = Perceptron(tuple(hidden), last, skip)
-    contact = _select_units(joined, [slice(start) for start in misfit_starts])
-    misfit = _select_units(joined, [slice(start, None) for start in misfit_starts])
+    contact = _select_units(joined, [slice(start) for start in first_misfit_units])
+    misfit = _select_units(joined, [slice(start, None) for start in first_misfit_units])
     return FoldedNetwork(features, contact, misfit)
 
 
@@ -186,8 +189,8 @@ def check_graph(
         compute_exact: Function that computes the outputs of the network in double precision.
         presses: Presses of the film.
         noise: Noise of good presses.
-        floors: Floors of x and y, mm, and of the force, N. The tolerance is proportional to the larger of two numbers:
-            the magnitude of an output and its floor.
+        floors: Floors of x and y, mm, and of the force, N, which replace the default floors. The tolerance of an output
+            is proportional to the larger of two numbers: the magnitude of the output and its floor.
 
     Returns:
         Charges for the golden vectors, float32, shape (n, n_electrode) with n up to `N_GOLDEN`, pC.
@@ -196,28 +199,29 @@ def check_graph(
         TrainingError: If an output is not finite, or the graph and the network disagree.
     """
     session = open_session(graph, "the exported graph")
-    golden_charge = _choose_golden_charges(compute_exact, presses, noise)
+    candidate_charge = _choose_golden_charges(compute_exact, presses, noise)
     _check_finite_outputs(session, n_electrode=presses.charge.shape[1])
-    # Find the presses for which every difference is less than a quarter of the tolerance, because another runtime
-    # rounds differently.
+    # Find the presses for which every difference is less than a quarter of the tolerance. The rest of the tolerance is
+    # left to other runtimes, which round differently.
     all_floors = FLOORS | {"contact": floors, "contact_std": floors}
-    is_reproducible: Booleans = np.full(len(golden_charge), True)
-    exact_outputs = compute_exact(golden_charge.astype(float))
-    for exact, (name, output) in zip(exact_outputs, run(session, golden_charge).items(), strict=True):
+    is_reproducible: Booleans = np.full(len(candidate_charge), True)
+    exact_outputs = compute_exact(candidate_charge.astype(float))
+    for exact, (name, output) in zip(exact_outputs, run(session, candidate_charge).items(), strict=True):
         tolerance = 0.25 * RELATIVE_TOLERANCE * np.maximum(np.abs(exact), all_floors[name])
         is_reproducible &= (np.abs(output - exact) < tolerance).all(axis=1)
     agreeing_count = np.count_nonzero(is_reproducible)
+    # If fewer than a quarter of the presses agree, the cause is not only the rounding at some charges.
     if agreeing_count < N_GOLDEN // 4:
         raise TrainingError(
             f"expected outputs of the exported graph that agree with those of the network within the rounding error of "
-            f"float32, got {agreeing_count} of {len(golden_charge)} presses that agree; train with more steps or "
+            f"float32, got {agreeing_count} of {len(candidate_charge)} presses that agree; train with more steps or "
             "another seed"
         )
-    return golden_charge[is_reproducible]
+    return candidate_charge[is_reproducible]
 
 
 def _choose_golden_charges(compute_exact: OutputFunction, presses: LabelledPresses, noise: Noise) -> Singles:
-    """Choose charges for the golden vectors.
+    """Choose charges for the golden vectors, with which every computer can check its answers.
 
     Three quarters of the chosen charges are charges of presses, and one quarter are extreme charges.
 
@@ -239,7 +243,7 @@ def _choose_golden_charges(compute_exact: OutputFunction, presses: LabelledPress
     well_determined_presses = presses[position_std <= np.median(position_std)]
 
     chosen_rows = np.linspace(0, len(well_determined_presses) - 1, 3 * N_GOLDEN // 4).astype(int)
-    press_charge = well_determined_presses[chosen_rows].noisy(noise, seed=2)
+    press_charge = well_determined_presses[chosen_rows].noisy(noise, seed=2)  # charges with noise
 
     # The last quarter has charges of presses times factors from 0.001 to 1000, zero charges and negative charges.
     factor = np.geomspace(1e-3, 1e3, N_GOLDEN // 4)

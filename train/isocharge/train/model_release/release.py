@@ -70,6 +70,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
         metadata: Metadata of the model.
         fitted: The network, its sensor and its presses.
     """
+    # The texts below are inserted into the card. Those of sections and lists end with a line break or are empty.
     electrodes = metadata.electrodes
 
     truth_text = MEASURED_TRUTH if "measured" in metadata.made_with else SIMULATED_TRUTH
@@ -81,6 +82,7 @@ def model_card(metadata: ModelMetadata, fitted: Fitted) -> str:
     misfit_text = "It is large if the charges do not belong to one press."
     if len(electrodes) == 3:
         misfit_text = "Three charges nearly always fit some contact."
+    # Each text in `LISTED_ERRORS` is a row of the table with a placeholder for the error.
     error_rows = "\n".join(
         f"| {row.format(metadata.errors[name])} |" for name, row in LISTED_ERRORS.items() if name in metadata.errors
     )
@@ -133,7 +135,7 @@ def _area_text(fitted: Fitted) -> str:
 
 def _forces_text(metadata: ModelMetadata) -> str:
     """Return a text about the range of forces, and about the force at which the film yields."""
-    constant_force = metadata.made_with.get("constant_force")
+    constant_force = metadata.made_with.get("constant_force")  # only if the network always returns the same force
     if constant_force is not None:
         reason = "all presses had this force" if constant_force["is_known"] else "the forces were not measured"
         return (
@@ -151,7 +153,10 @@ def _forces_text(metadata: ModelMetadata) -> str:
 
 
 def _presses_text(metadata: ModelMetadata) -> str:
-    """Return a text about the presses on which the errors were measured."""
+    """Return a text about the presses on which the errors were measured.
+
+    The text continues a sentence that begins with their number, and has no full stop.
+    """
     measured = metadata.made_with.get("measured")
     if measured is not None:
         position_factor, force_factor = measured["std_factors"]
@@ -207,6 +212,7 @@ def release(
         TrainingError: If the exported graph and the network disagree.
     """
     errors = evaluate(fitted)
+    # The reasons in this warning concern only simulated presses.
     if errors["misfit_p999"] > 2.0 * MISFIT_LIMIT and "measured" not in fitted.made_with:
         log.warning(
             "one in a thousand good presses has a misfit above %.3g, because the charges of different probes, "
@@ -215,7 +221,10 @@ def release(
         )
     packages = ("isocharge", "numpy", "onnx", "onnxruntime", "torch")
     package_versions = {name: installed_version(name) for name in packages}
-    metadata_without_unnoticed = ModelMetadata(
+
+    # The attribute `unnoticed` states how often the answer to a press outside the working area is wrong and carries no
+    # flag. Its computation needs the other metadata.
+    draft_metadata = ModelMetadata(
         name=Path(folder).resolve().name,
         version=version,
         sensor=dict(fitted.sensor),
@@ -224,7 +233,7 @@ def release(
         probes=fitted.probes,
         force_range_N=fitted.domain.force_range,
         noise=convert(fitted.noise.to_dict(), ModelNoise, "noise of the training", ModelError),
-        dataset_sha256=fitted.sha256,
+        dataset_sha256=fitted.sha256,  # checksum of the training data
         errors=errors,
         made_with={
             "command": command,
@@ -234,10 +243,11 @@ def release(
         },
         yield_force_N=fitted.yield_force_N,
     )
-    unnoticed = unnoticed_presses(fitted, metadata_without_unnoticed)
-    complete_metadata = structs.replace(metadata_without_unnoticed, unnoticed=unnoticed)
+    unnoticed = unnoticed_presses(fitted, draft_metadata)
+    complete_metadata = structs.replace(draft_metadata, unnoticed=unnoticed)
 
     graph = write_graph(fitted.network, complete_metadata.to_props())
+    # Compare the graph with the network. The tolerance of a number below its floor (x, y, force) is that of the floor.
     floors = contact_floors(complete_metadata)
     golden_charges = check_graph(graph, fitted.network.outputs, fitted.test, misfit_noise(fitted.noise), floors)
     card = model_card(complete_metadata, fitted)
