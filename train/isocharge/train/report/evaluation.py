@@ -80,7 +80,8 @@ class Method:
     def call_in_turn(self, charge: Array) -> Callable[[], object]:
         """Return a function without arguments. Each call of the function estimates the contact of the next press.
 
-        The duration of the calls is measured. After the last press, the function begins again with the first press.
+        This method estimates nothing itself. The duration of the calls of the returned function is measured. After the
+        last press, the function begins again with the first press.
 
         Args:
             charge: Charges of the presses, shape (n, n_electrode), pC.
@@ -120,9 +121,11 @@ def model_method(predictor: Predictor) -> Method:
 
     def single_call(charge: Array) -> Callable[[], object]:
         """Return a function that computes the complete answer to one press."""
-        answer = np.zeros(len(Contact._fields), np.float32)  # overwritten by every call
-        return partial(predictor.predict_into, charge.astype(np.float32), answer)
+        # Every call writes its answer into this array. Only the duration of the calls matters.
+        answer_buffer = np.zeros(len(Contact._fields), np.float32)
+        return partial(predictor.predict_into, charge.astype(np.float32), answer_buffer)
 
+    # The arguments are the name and the library of the method, its function for many presses, and its function for one.
     return Method(
         f"network `{predictor.metadata.label}`",
         "Predictor",
@@ -230,22 +233,23 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
     model = predictor.metadata
     check_same_sensor(model, dataset)
     covered_dataset = _covered_presses(dataset, model)
-    presses, test = split_presses(covered_dataset, model_folder, model)
+    fit_presses, test = split_presses(covered_dataset, model_folder, model)
     domain = LabelledPresses.of(covered_dataset.samples).domain
     measured = is_measured(dataset)
-    # The noise determines the weights of the charges in a fit. The noise is added only to simulated presses, because
-    # the charges of measured presses already contain noise.
+    # The noise of the training determines the weights of the charges in a fit. The noise is added only to simulated
+    # presses, because the charges of measured presses already contain noise. That noise is unknown.
     noise = noise_of(model)
-    if not measured:
+    if not measured:  # `settings.presses` is the smallest number of test presses
         repeated_test = test.repeated(settings.presses)
         test = replace(repeated_test, charge=repeated_test.noisy(noise, SEED))
 
-    # Fit the other methods, which is impossible with too few presses.
+    # Fit the other methods. With too few presses, the fit of the series or of a method raises TrainingError, and the
+    # report states the reason. `omissions` lists the reasons why methods or the Cramér-Rao limit are left out.
     methods = [model_method(predictor)]
-    limits: dict[str, float] = {}
-    failure_reasons = []
+    cramer_rao_limits: dict[str, float] = {}
+    omissions = []
     try:
-        train, validation = split_by_position(presses, TrainingConfig().hold_out)
+        train, validation = split_by_position(fit_presses, TrainingConfig().hold_out)
         charge_map = fit_charge_series(domain, dataset.sensor.electrode_names, train, validation, noise.white)
         task = FittingTask(charge_map, noise)
         methods += [build_method(task) for build_method in METHOD_BUILDERS]
@@ -255,17 +259,17 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
             series_error_pC = charge_map.charges(validation.contact) - validation.charge
             if rms(series_error_pC / noise.sigma(validation.charge)) < 1.0:  # the error is smaller than the noise
                 cramer_rao = limits_at(charge_map, test.contact, noise)
-                limits = {
+                cramer_rao_limits = {
                     "position_rms_mm": rounded(rms(cramer_rao.position)),
                     "force_rms_percent": rounded(100.0 * rms(cramer_rao.force)),
                 }
             else:
-                failure_reasons.append(
+                omissions.append(
                     f"Cramér-Rao limit: a series that is fitted to {len(train)} presses has an error of "
                     f"{100.0 * charge_map.charge_std:.2g} % of a charge, more than the noise; simulate more presses"
                 )
     except TrainingError as error:
-        failure_reasons.append(str(error))
+        omissions.append(str(error))
     return Section(
         sensor=dataset.sensor.name,
         measured=measured,
@@ -274,11 +278,11 @@ def evaluate_dataset(dataset: Dataset, model_folder: Path, settings: Settings) -
         force_N=domain.force_range,
         noise=None if measured else noise.name,
         dataset_sha256=dataset.sha256,
-        fitted_presses=len(presses),
+        fitted_presses=len(fit_presses),
         test_presses=len(test),
-        limits=limits,
+        limits=cramer_rao_limits,
         methods=measure_methods(methods, test, settings.seconds),
-        left_out=failure_reasons,
+        left_out=omissions,
     )
 
 
@@ -318,18 +322,21 @@ def split_presses(
     Args:
         dataset: The presses of a dataset that the model covers.
         model_folder: Version folder of the model.
-        model: Metadata of the model.
+        model: Metadata of the model. The entry `config` of `made_with` contains the settings of its training.
 
     Raises:
         DatasetError: If the methods cannot be fitted to the dataset.
         PressError: If the model was calibrated from all presses that are held out.
     """
     if not is_measured(dataset):
-        hold_out = TrainingConfig().hold_out
-        if model.dataset_sha256 == dataset.sha256 and "config" in model.made_with:  # not a network of another program
+        hold_out = TrainingConfig().hold_out  # a tenth
+        # Was the model trained on this dataset? The metadata of a network of another program contain no settings.
+        if model.dataset_sha256 == dataset.sha256 and "config" in model.made_with:
+            # The positions of a smaller share are also held out with a larger share.
             hold_out = min(hold_out, model.made_with["config"]["training"]["hold_out"])
         return split_by_position(presses_of(dataset), hold_out)
 
+    # A measured dataset needs at least `MIN_PLACES` presses. A fifth is held out.
     presses, held_out = split_by_position(presses_of(dataset, MIN_PLACES), 1.0 / N_FOLDS)
     is_learned = have_charges_of(held_out.charge, _calibration_charges(model_folder, model))
     if is_learned.all():
@@ -386,7 +393,7 @@ def check_same_sensor(model: ModelMetadata, dataset: Dataset) -> None:
         expected = sensor_to_dict(dataset.sensor)
         keys = (expected.keys() | model.sensor.keys()) - {"name"}
         differences += sorted(key for key in keys if expected.get(key) != model.sensor.get(key))
-    elif "film" not in model.sensor:
+    elif "film" not in model.sensor:  # trained only on measured presses
         raise ModelError(
             f"model {model.label}: expected a model of a film, got a model of presses alone, which has learned from "
             "all presses; its card states its errors on held-out presses"
@@ -403,7 +410,7 @@ def measure_methods(methods: Sequence[Method], presses: LabelledPresses, seconds
     """Measure the errors and the durations of all methods.
 
     The methods take turns in short periods of timing. If the speed of the machine changes, the change therefore affects
-    all methods in the same way.
+    all methods in the same way. The errors are those on the presses for which a method has an estimate.
 
     Args:
         methods: The fitted methods.
@@ -414,15 +421,16 @@ def measure_methods(methods: Sequence[Method], presses: LabelledPresses, seconds
         The records of the methods, in the order of `methods`.
     """
     timed_charge = presses.charge[:SINGLE_PRESSES]
+    # Each call estimates one press.
     contenders = [Contender(method.name, 1, method.call_in_turn(timed_charge)) for method in methods]
     timings = take_turns(contenders, len(methods) * seconds)
     records = []
     for method, timing in zip(track(methods, "estimating contacts"), timings, strict=True):
         estimate = method.estimate(presses.charge)
-        is_answered = np.isfinite(estimate).all(axis=1)
+        is_answered = np.isfinite(estimate).all(axis=1)  # a press without an estimate has the contact NaN
         errors = {}
         if is_answered.any():
             errors = contact_error_statistics(estimate[is_answered], presses.contact[is_answered])
-        answered = float(np.mean(is_answered))
-        records.append(MethodRecord(method.name, method.library, answered, errors, rounded(timing.p50_us)))
+        answered_share = float(np.mean(is_answered))
+        records.append(MethodRecord(method.name, method.library, answered_share, errors, rounded(timing.p50_us)))
     return records

@@ -78,7 +78,7 @@ def report_page(sections: Sequence[Section], settings: Settings, machine: Mappin
 
 
 def _conditions(section: Section) -> str:
-    """Return a paragraph about the presses of a dataset."""
+    """Return a paragraph about the presses of a dataset and the conditions of their evaluation."""
     min_force, max_force = section.force_N
     area = (
         f"**{section.sensor}**: {', '.join(section.probes)} within {section.radius_mm:.3g} mm, {min_force:.3g} to "
@@ -109,7 +109,7 @@ def _table_lines(sections: Sequence[Section]) -> Iterator[str]:
     n_number_columns = len(HEADER) - TEXT_COLUMNS
     yield "|" + "---|" * TEXT_COLUMNS + "--:|" * n_number_columns  # numbers are aligned to the right
     for section in sections:
-        if section.limits:
+        if section.limits:  # the limit has no library and no time
             yield _table_line([section.sensor, "*Cramér-Rao limit, unbiased*", "", *_error_cells(section.limits), ""])
         for record in sorted(section.methods, key=_position_error):
             name = record.name
@@ -148,13 +148,13 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
     figure = new_figure(6.5 * len(sections), 4.5)
     panels = figure.subplots(1, len(sections), squeeze=False)
     for axes, section in zip(panels[0], sections, strict=True):
-        answered = [record for record in section.methods if record.errors]
+        answered = [record for record in section.methods if record.errors]  # methods with at least one estimate
         for record in answered:
             style: dict[str, Any] = {"marker": "o", "ms": 7}
             if record is section.methods[0]:  # the evaluated model
                 style = {"marker": "*", "ms": 14, "color": FELT}
             error_mm = _position_error(record)
-            label = f"{record.name.replace('`', '')}, {error_mm:.3g} mm"
+            label = f"{record.name.replace('`', '')}, {error_mm:.3g} mm"  # without the backticks of Markdown
             axes.plot(record.single_press_us, error_mm, ls="", label=label, **style)
         if section.limits:
             limit_mm = section.limits["position_rms_mm"]
