@@ -94,7 +94,7 @@ class NetworkConfig(Settings, frozen=True):
         """
         default = Sizes.for_electrodes(n_electrode)
         layer_count = len(self.hidden or self.misfit_hidden or default.hidden)
-        hidden = self.hidden or default.hidden[:1] * layer_count  # the first width, once for each layer
+        hidden = self.hidden or default.hidden[:1] * layer_count  # the tuple (first width,), repeated for each layer
         misfit_hidden = self.misfit_hidden or default.misfit_hidden[:1] * layer_count
         return hidden, misfit_hidden
 
@@ -155,7 +155,10 @@ class FitConfig(Settings, frozen=True):
     training: TrainingConfig = TrainingConfig()
 
     def for_electrodes(self, n_electrode: int) -> "FitConfig":
-        """Return a copy of the settings, in which missing sizes are the defaults for the given number of electrodes."""
+        """Return a copy of the settings, in which missing sizes are the defaults for the given number of electrodes.
+
+        The sizes are the widths of the hidden layers, the numbers of steps, and the number of examples of misfits.
+        """
         hidden, misfit_hidden = self.network.widths(n_electrode)
         network = replace(self.network, hidden=hidden, misfit_hidden=misfit_hidden)
         sizes = self.training.sizes(n_electrode)

@@ -54,13 +54,15 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
     likelihood would enlarge the intervals of all contacts.
 
     Args:
-        posterior: Standard deviations and angles of the correlations (`isocharge.train.training.folded_network`).
+        posterior: Logarithms of the standard deviations of x, y and ln F, shape (n, 3), and turns, shape (n, 3). A turn
+            is an angle of the correlations (`isocharge.train.training.folded_network`) minus pi / 2.
         error: Errors of the unit coordinates, shape (n, 3), which are constants in this loss.
     """
+    # Errors in standard deviations. Without gradients of the errors (`detach`), the loss does not train the mean.
     x_deviation, y_deviation, force_deviation = (error.detach() * torch.exp(-posterior.log_std)).unbind(dim=1)
 
-    # The angles a, b and c of the correlations are pi / 2 + turn, so that their sines are the cosines of the turns, and
-    # their cosines are the sines of the negative turns.
+    # The angles a, b and c of the correlations are pi / 2 + turn, so that sin(a) = cos(turn) and cos(a) = sin(-turn).
+    # `MIN_SINE` keeps the divisors below away from zero.
     sin_a, sin_b, sin_c = torch.cos(posterior.turn).clamp(min=MIN_SINE).unbind(dim=1)
     cos_a, cos_b, cos_c = torch.sin(-posterior.turn).unbind(dim=1)
 
@@ -73,8 +75,8 @@ def covariance_loss(posterior: Posterior, error: Tensor) -> Tensor:
 
     # The logarithm of the t distribution replaces half of the square of a normal distribution. `TAIL_FACTOR` makes the
     # loss smallest at the true standard deviation if the errors are normally distributed.
-    squares = torch.stack([x_deviation, independent_y, independent_force]) ** 2
-    return log_determinant + TAIL_FACTOR * torch.log1p(squares / DEGREES_OF_FREEDOM).sum(dim=0)
+    squared_errors = torch.stack([x_deviation, independent_y, independent_force]) ** 2  # independent, shape (3, n)
+    return log_determinant + TAIL_FACTOR * torch.log1p(squared_errors / DEGREES_OF_FREEDOM).sum(dim=0)
 
 
 def contact_stage(
@@ -97,7 +99,10 @@ def contact_stage(
     unit_contact = as_tensor(domain.to_unit(train.contact))
 
     def loss(random: torch.Generator) -> Tensor:
-        """Return the loss of a random batch with new noise.
+        """Return the loss of a random batch of the training presses with new noise.
+
+        The arrays `charge` and `noise_std`, shape (n, n_electrode), and `unit_contact`, shape (n, 3), belong to all
+        presses.
 
         Args:
             random: Random number generator of the batch and of its noise.
@@ -112,6 +117,8 @@ def contact_stage(
         loss_of_covariance = covariance_loss(posterior, target - posterior.mean)
         return (loss_of_mean + loss_of_covariance).mean()
 
+    # The sizes are the settings in `config`, or defaults for the number of electrodes. The rate is lower for many
+    # electrodes.
     sizes = config.sizes(network.features.n_electrode)
     rate = config.learning_rate * sizes.rate_factor
     return TrainingStage("contact", network.contact, loss, sizes.steps, rate, config.seed)
@@ -150,24 +157,31 @@ def refit_covariance(network: InverseNetwork, train: LabelledPresses, noise: Noi
     """
     presses = train.repeated(REFIT_PRESSES)
     target = as_tensor(network.domain.to_unit(presses.contact))
-    weight = network.contact.linear_layers[-1].weight.data
+    weight = network.contact.linear_layers[-1].weight.data  # shares its memory with the network; (n_output, n_hidden)
     with torch.no_grad():
         inputs = network.inputs(as_tensor(presses.noisy(noise, seed=0)))
         outputs = network.contact(inputs)
         hidden = network.contact.last_hidden(inputs)  # H, shape (n, n_hidden)
         gram_matrix = hidden.T @ hidden
         gram_matrix.diagonal().add_(RIDGE)
-        inverse_factor = torch.linalg.inv(torch.linalg.cholesky(gram_matrix))  # L^-1
+        inverse_gram_factor = torch.linalg.inv(torch.linalg.cholesky(gram_matrix))  # L^-1
 
     def loss_and_gradient(entries: Array) -> tuple[float, Array]:
-        """Return the loss and its gradient with respect to the entries of M, each row after the other."""
-        fitted_matrix = as_tensor(entries).view_as(weight).requires_grad_()
-        new_outputs = outputs + hidden @ (fitted_matrix @ inverse_factor).T
-        posterior = Posterior(*new_outputs.split(3, dim=1))
+        """Return the loss over all presses and its gradient with respect to the entries of the fitted matrix M.
+
+        The weights of the last layer change by M L^-1, where L^-1 is `inverse_gram_factor`. `outputs` are the outputs
+        for M = 0, and `hidden` are the hidden units, which the weights map to the outputs.
+
+        Args:
+            entries: Entries of M, each row after the other. M has the shape of `weight`, (n_output, n_hidden).
+        """
+        matrix_m = as_tensor(entries).view_as(weight).requires_grad_()
+        new_outputs = outputs + hidden @ (matrix_m @ inverse_gram_factor).T
+        posterior = Posterior(*new_outputs.split(3, dim=1))  # three means, three log stds and three turns
         loss = covariance_loss(posterior, target - posterior.mean).sum()
-        (gradient,) = torch.autograd.grad(loss, fitted_matrix)
+        (gradient,) = torch.autograd.grad(loss, matrix_m)
         return loss.item(), gradient.numpy().ravel()
 
     start = np.zeros(weight.numel())
     result = minimize(loss_and_gradient, start, jac=True, method="L-BFGS-B", tol=LOSS_TOLERANCE)
-    weight += as_tensor(result.x).view_as(weight) @ inverse_factor
+    weight += as_tensor(result.x).view_as(weight) @ inverse_gram_factor  # in place, so that the network changes

@@ -222,9 +222,12 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
     if not is_any_force_known:
         assumed_contact = presses.contact.copy()
         assumed_contact[:, 2] = UNKNOWN_FORCE_N
+        # `force_std` is relative to the force, so that 1 stands for a standard deviation of the size of the force.
         presses = replace(presses, contact=assumed_contact, force_std=np.ones(len(presses)))
     check_known_columns(presses)
     usable = presses[complete(presses)]  # the place, the force and all charges of each press are known
+    # Positions that differ by at most the errors of an encoder become one position. Only for counting the places,
+    # positions that differ by their stated standard deviations also count as one place.
     usable = replace(usable, contact=merged_places(usable.contact))
     usable_places = place_count(merged_uncertain_places(usable))
     if len(usable) < MIN_PRESSES or usable_places < MIN_PLACES:
@@ -244,7 +247,7 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
             UNKNOWN_FORCE_N,
             UNKNOWN_FORCE_N,
         )
-    elif constant_force_std(usable) is not None:
+    elif constant_force_std(usable) is not None:  # all forces are nearly equal
         _log.warning(
             "all presses have a force of about %.3g N: the model can estimate no other force, and learns x and y alone",
             usable.contact[:, 2].mean(),
@@ -335,7 +338,7 @@ def _misfit_examples(charge: Array, unit_contact: Array, noise: ChannelNoise, co
     """
     planes = LocalPlanes.fit(unit_contact, noise.level(charge))
     _, n_electrode = charge.shape
-    count = config.sizes(n_electrode).misfit_charges
+    count = config.sizes(n_electrode).misfit_charges  # number of sets of charges
     drawn_charge = draw_charges(np.random.default_rng(config.seed), charge, noise, count)
     return np.stack([drawn_charge, planes.residuals(noise.level(drawn_charge))])
 
@@ -369,17 +372,20 @@ def _cross_validate(
     """
     level = noise.level(presses.charge)
     added_noise = noise.scaled(TRAINING_NOISE_FACTOR)
+    # Contacts, standard deviations and misfits, which are filled in fold by fold
     answers = Answers(np.empty_like(unit_contact), np.empty_like(unit_contact), np.empty((len(presses), 1)))
     for fold_index, network in enumerate(fold_networks):
         is_in_fold = fold_of_press == fold_index
         fold_config = structs.replace(config, seed=config.seed + fold_index)
-        contact_stage(network, presses[~is_in_fold], added_noise, fold_config).run()
+        contact_stage(network, presses[~is_in_fold], added_noise, fold_config).run()  # trains the network in place
 
+        # `fold_network` includes the scaling of inputs and outputs in the layers, and has nothing to do with the fold.
         contact, std, *_ = fold_network(network).outputs(presses.charge[is_in_fold])
         answers.contact[is_in_fold] = contact
         answers.std[is_in_fold] = std
-        planes = LocalPlanes.fit(unit_contact[~is_in_fold], level[~is_in_fold])
-        residual = planes.residuals(level[is_in_fold])
+        # Compare each level with the nearest point of the planes of the other folds.
+        planes_of_others = LocalPlanes.fit(unit_contact[~is_in_fold], level[~is_in_fold])
+        residual = planes_of_others.residuals(level[is_in_fold])
         answers.misfit[is_in_fold] = np.linalg.norm(residual, axis=1, keepdims=True)
     return answers
 
@@ -409,7 +415,7 @@ def _distillation_stage(
     # means of the contact, the logarithms of its standard deviations, and the turns that determine its correlations.
     with torch.no_grad():
         outputs = [torch.cat(fold_network.posterior(charge), dim=1) for fold_network in fold_networks]
-    target = torch.stack(outputs).mean(dim=0)  # shape (number of rows, n_output)
+    target = torch.stack(outputs).mean(dim=0)  # shape (number of rows, n_output), with the columns MEAN, LOG_STD, turns
     # The loss below is a weighted sum of squared differences from the targets. As in the likelihood of a normal
     # distribution, the weight of a mean is half of its inverse variance. The weights of all other outputs are 1.
     weight = torch.ones_like(target)

@@ -44,8 +44,8 @@ class Soap:
     def __init__(self, parameter: Tensor) -> None:
         """Prepare the first step: all averages are zero, and the eigenbases are identity matrices.
 
-        A matrix has two moments with their eigenbases: one for its rows, and one for its columns. A vector has no
-        moments.
+        A matrix with the gradient G has two moments with their eigenbases: the average of G G^T for its rows, and the
+        average of G^T G for its columns. A vector has no moments.
 
         Args:
             parameter: The parameter, a vector or a matrix.
@@ -90,7 +90,7 @@ class Soap:
         self.mean_square.lerp_(_rotate(gradient, self.bases) ** 2, new_weight)
 
         # The moving averages begin at zero. The averages are therefore divided by the total weight of all gradients so
-        # far.
+        # far. The ratio contains the weight twice: for the averaged gradient, and below the root.
         total_weight = 1.0 - DECAY**self.step_count
         root_mean_square = torch.sqrt(self.mean_square / total_weight) + torch.finfo(gradient.dtype).tiny  # never zero
         ratio = _rotate(self.mean_gradient, self.bases) / (total_weight * root_mean_square)
@@ -184,6 +184,7 @@ class TrainingStage:
             report(f"training the {self.name} network", step + 1, self.steps, f"loss {mean_loss:.3f}")
             if mean_loss > smallest_mean_loss + MAX_LOSS_INCREASE:
                 largest_rate *= 0.5
+                # `checkpoints[0]` contains the weights of the older of the latest two reports.
                 for parameter, earlier_weights in zip(parameters, checkpoints[0], strict=True):
                     parameter.data.copy_(earlier_weights)
             else:

@@ -141,12 +141,13 @@ def fit(source: Dataset | TrainingData, config: FitConfig | None = None) -> Fitt
         refit_covariance(network, split.train, training.noise_model)
         misfit_training.result()
 
-    made_with: dict[str, object] = {"config": settings.to_dict()}
+    made_with: dict[str, object] = {"config": settings.to_dict()}  # for the metadata of the model
     if split.cautions:
         made_with["cautions"] = list(split.cautions)
     files = {}
-    if split.folded_charges is not None:
+    if split.folded_charges is not None:  # the map from contacts to charges folds
         files[CHARGES_FILE] = charge_map_bytes(split.folded_charges)
+    # `fold_network` includes the scaling of inputs and outputs in the layers.
     return Fitted(
         network=fold_network(network),
         sensor=sensor_to_dict(data.sensor),

@@ -227,7 +227,8 @@ class FoldedNetwork:
     def onnx_model(self, number_type: type = np.float32) -> onnx.ModelProto:
         """Return the network as an ONNX model without metadata.
 
-        The nodes after the perceptrons convert the answers into the outputs of the graph.
+        The nodes after the perceptrons convert the answers into the outputs of the graph. Each tensor is represented by
+        its name, which the methods of the builder return, and which the argument `to` can set.
 
         Args:
             number_type: NumPy type of the charges, of the constants and of the outputs.
@@ -239,12 +240,12 @@ class FoldedNetwork:
         builder = GraphBuilder(number_type)
         n_electrode = self.features.n_electrode
         tensor_type = "double" if number_type is np.float64 else "float"
-        features = _add_features(builder, self.features)
+        features = _add_features(builder, self.features)  # name of the tensor with the features
         answers = _add_perceptrons(builder, features, [self.contact, self.misfit])
 
         # Split the answers: x and y, the logarithms of the force and of the three standard deviations, the angles that
         # determine the correlations, and the misfit vector. The exponentials of the limited logarithms are the force
-        # and the standard deviations. The argument `to` names the results, such as the output `contact_std`.
+        # and the standard deviations. `COSINES_TO_CORRELATIONS` has a row for each of the eight angles.
         widths = builder.constant((2, 4, len(COSINES_TO_CORRELATIONS), n_electrode), np.int64)
         builder.add("Split <axis = 1>", answers, widths, to="plane, logs, angles, misfit_vector")
         limits = (builder.constant(-LARGEST_LOGARITHM), builder.constant(LARGEST_LOGARITHM))
@@ -254,8 +255,8 @@ class FoldedNetwork:
         cosines = builder.add("Cos", "angles")
         builder.add("MatMul", cosines, builder.constant(COSINES_TO_CORRELATIONS), to=CORRELATION)
         # The length of the misfit vector is asinh(misfit / MISFIT_LIMIT).
-        compressed_misfit = builder.add("ReduceL2 <axes = [1], keepdims = 1>", "misfit_vector")
-        builder.add("Mul", builder.add("Sinh", compressed_misfit), builder.constant(MISFIT_LIMIT), to="misfit")
+        asinh_misfit = builder.add("ReduceL2 <axes = [1], keepdims = 1>", "misfit_vector")
+        builder.add("Mul", builder.add("Sinh", asinh_misfit), builder.constant(MISFIT_LIMIT), to="misfit")
 
         outputs = ", ".join(f"{tensor_type}[n, {width}] {name}" for name, width in OUTPUTS.items())
         nodes = "\n".join(builder.nodes)
@@ -274,7 +275,7 @@ class FoldedNetwork:
         The answers are logarithms of the standard deviations. Therefore, the logarithms of the factors are added to the
         bias of the last layer.
         """
-        weight, bias = self.contact.last
+        weight, bias = self.contact.last  # the last layer
         bias_change = np.zeros_like(bias)
         bias_change[LOG_STD] = np.log([position_factor, position_factor, force_factor])
         return replace(self, contact=replace(self.contact, last=Layer(weight, bias + bias_change)))
@@ -322,15 +323,15 @@ def _add_perceptrons(builder: GraphBuilder, inputs: str, perceptrons: Sequence[P
         Name of the tensor with the outputs of all perceptrons.
     """
     hidden_outputs = inputs
-    for layers in zip(*(perceptron.hidden for perceptron in perceptrons), strict=True):
+    for layers in zip(*(perceptron.hidden for perceptron in perceptrons), strict=True):  # one layer of each perceptron
         weights, biases = zip(*layers, strict=True)
-        is_first = hidden_outputs is inputs
+        is_first = hidden_outputs is inputs  # the first layer reads the inputs
         joined_weight = builder.constant(np.hstack(weights) if is_first else block_diag(*weights))
         joined_bias = builder.constant(np.concatenate(biases))
         hidden_outputs = builder.add("Tanh", builder.add("Gemm", hidden_outputs, joined_weight, joined_bias))
 
-    # The output of the skip layer, which includes the bias of the last layer, takes the place of the bias in the last
-    # `Gemm`.
+    # In the last `Gemm`, the output of the skip layer takes the place of the bias. This output includes the bias of the
+    # last layer.
     skip = builder.constant(np.hstack([perceptron.skip for perceptron in perceptrons]))
     last_weights, last_biases = zip(*(perceptron.last for perceptron in perceptrons), strict=True)
     skip_and_bias = builder.add("Gemm", inputs, skip, builder.constant(np.concatenate(last_biases)))
@@ -387,21 +388,24 @@ The arguments are a, b, a - b, a + b, a - b - c, a - b + c, a + b - c and a + b 
 def linear_answer_map(domain: Domain) -> Layer:
     """Return the linear map from the outputs of the contact perceptron to its answers.
 
-    The outputs are three means, three logarithms of standard deviations, and three angles:
+    The 9 outputs are three means (`MEAN`), three logarithms of standard deviations (`LOG_STD`), and three turns
+    (`TURN`). A turn is an angle a, b or c minus a right angle. The 14 answers have the same columns `MEAN` and
+    `LOG_STD`, followed by the arguments of eight cosines (`ANGLES`). Each of these names is a slice of columns.
 
     - The means are unit coordinates, which range from -1 to 1. The map converts the means to x, y and ln F.
     - The perceptron computes the logarithm of the relative standard deviation of the force. The answer is the logarithm
       of the absolute standard deviation in N. The map therefore adds ln F.
     - The correlations are weighted sums of eight cosines. The argument of each cosine is a sum of the angles, in which
-      some angles have a negative sign. The map computes the eight arguments.
+      some angles have a negative sign. The map adds the right angles, and computes the eight arguments.
 
     Args:
         domain: Domain that defines the centre and the scale of the unit coordinates.
     """
-    weight = block_diag(np.eye(TURN.start), ANGLES_TO_COSINE_ARGUMENTS)
+    # The map copies the outputs before the turns, and computes the arguments of the cosines from the turns.
+    weight = block_diag(np.eye(TURN.start), ANGLES_TO_COSINE_ARGUMENTS)  # shape (9, 14)
     bias = np.zeros(weight.shape[1])
 
-    # Means: u * scale + centre.
+    # Means: u * scale + centre. Each column is multiplied by its scale.
     weight[MEAN, MEAN] *= domain.scale
     bias[MEAN] = domain.centre
 
@@ -411,6 +415,6 @@ def linear_answer_map(domain: Domain) -> Layer:
     weight[MEAN, LOG_FORCE_STD] = weight[MEAN, LOG_FORCE]
     bias[LOG_FORCE_STD] += bias[LOG_FORCE]
 
-    # The perceptron computes the angles minus a right angle.
+    # Arguments of the cosines: the turns are the angles minus a right angle, so add the arguments for right angles.
     bias[ANGLES] = 0.5 * np.pi * ANGLES_TO_COSINE_ARGUMENTS.sum(axis=0)
     return Layer(weight, bias)

@@ -44,9 +44,9 @@ def draw_charges(rng: np.random.Generator, charge: Array, noise: ChannelNoise, c
     """
     rows = rng.integers(len(charge), size=count)
     level = noise.level(charge[rows])
-    # Whether an electrode has a special error. Each press has its own probability of special errors.
+    # Whether an electrode has a special error, which is not due to noise. Each press has its own probability of them.
     is_special = rng.random(level.shape) < rng.random((count, 1))
-    special_std = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))
+    special_std = 10.0 ** rng.uniform(*LOG_DISTANCES, (count, 1))  # `LOG_DISTANCES` contains decimal logarithms
     error_std = np.where(is_special, special_std, 1.0)  # the noise has the standard deviation 1
     error = error_std * rng.standard_normal(level.shape)
     return noise.charge(level + error)
@@ -85,7 +85,7 @@ def misfit_examples(
         contact, in standard deviations of the noise.
     """
     rng = np.random.default_rng(config.seed)
-    noise = ChannelNoise.alike(misfit_noise(config.noise_model))
+    noise = ChannelNoise.alike(misfit_noise(config.noise_model))  # the same noise on every electrode
     count = config.sizes(features.n_electrode).misfit_charges
     outside_charge = np.empty((0, features.n_electrode))
     if outside is not None:
@@ -93,7 +93,7 @@ def misfit_examples(
         outside_charge = noise.add(outside.train.charge[rows], rng)
     drawn_charge = draw_charges(rng, split.train.charge, noise, count - len(outside_charge))
     charge = np.clip(np.concatenate([drawn_charge, outside_charge]), features.low_pC, features.high_pC)
-    _, residual = search(split.field, charge, noise.sigma(charge))
+    _, residual = search(split.field, charge, noise.sigma(charge))  # residuals at the nearest contact
     return np.stack([charge, residual])
 
 
@@ -119,6 +119,7 @@ def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfi
         rows = torch.randint(len(inputs), (config.batch,), generator=random)
         return focused_squared_distance(network.misfit_vector(inputs[rows]), targets[rows])
 
+    # `network.misfit_vector` is the misfit perceptron, which is called above, and whose weights are trained.
     steps = config.sizes(network.features.n_electrode).misfit_steps
     return TrainingStage("misfit", network.misfit_vector, loss, steps, config.learning_rate, config.seed)
 

@@ -59,9 +59,10 @@ def logarithmic_features(charge: Array, white_noise_pC: float = LOWEST_CHARGE) -
 
 
 def signed_features(charge: Array, typical: Array) -> ChargeFeatures:
-    """Return features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
+    """Define features for charges of both signs: asinh(charge / typical charge) minus its mean over the given charges.
 
-    Before the conversion, each charge is limited to a range that is wider than the range of the given charges. On the
+    The given charges determine the mean and the limits of the features. No feature is computed here. When features are
+    computed, each charge is first limited to a range that is wider than the range of the given charges. On the
     scale of the inverse hyperbolic sine, the limits are the smallest given value minus the width of the given range,
     and the largest given value plus this width.
 
@@ -129,7 +130,7 @@ class TrainablePerceptron(nn.Module):
         super().__init__()
         widths = (n_input, *hidden, n_output)
         self.linear_layers = [nn.Linear(n_in, n_out) for n_in, n_out in pairwise(widths)]  # from first to last
-        self.layers = nn.ModuleList(self.linear_layers)  # registers the parameters of the layers
+        self.layers = nn.ModuleList(self.linear_layers)  # the same layers, so that PyTorch finds their parameters
         self.skip = nn.Linear(n_input, n_output, bias=False)
         nn.init.zeros_(self.skip.weight)
 
@@ -174,10 +175,11 @@ class TrainablePerceptron(nn.Module):
         Each rounded weight is the product of a scale and an integer from -127 to 127. All weights that lead to the same
         unit have the same scale.
         """
-        _, *between, _ = self.linear_layers
+        _, *between, _ = self.linear_layers  # all layers except the first and the last
         for matrix in (layer.weight for layer in between):
             weights = matrix.detach()  # shares its memory with the matrix, so that `copy_` below changes the matrix
             scale = weights.abs().amax(dim=1, keepdim=True) / LARGEST_INT8  # shape (n_output, 1)
+            # The smallest divisor `tiny` prevents a division by the scale 0 of a row of zeros.
             integers = torch.round(weights / scale.clamp(min=torch.finfo(weights.dtype).tiny))
             weights.copy_(integers * scale)
             matrix.requires_grad_(False)
@@ -223,25 +225,27 @@ class InverseNetwork(nn.Module):
         self.domain = domain
         self.features = features
         n_electrode = features.n_electrode
+        n_output = TURN.stop  # three means, three logarithms of standard deviations, and three turns
         widths, misfit_widths = config.widths(n_electrode)
-        self.contact = TrainablePerceptron(n_electrode, widths, TURN.stop)
-        self.contact.sharpen_first_layer()
+        self.contact = TrainablePerceptron(n_electrode, widths, n_output)
+        self.contact.sharpen_first_layer()  # replaces the weights by larger ones
         self.misfit_vector = TrainablePerceptron(n_electrode, misfit_widths, n_electrode)
 
-        # Without a force to learn, constants replace the outputs for the force: the middle of the range of forces (0),
-        # its given standard deviation in unit coordinates, and no correlations (0).
-        self.output_factor = nn.Buffer(torch.ones(TURN.stop))
-        self.output_offset = nn.Buffer(torch.zeros(TURN.stop))
+        # The final outputs are outputs * factor + offset. Without a force to learn, the factor 0 lets constants replace
+        # the outputs for the force: the middle of the range of forces (0), its given standard deviation in unit
+        # coordinates, and no correlations (0). `domain.scale[2]` is the scale of ln F.
+        self.output_factor = nn.Buffer(torch.ones(n_output))
+        self.output_offset = nn.Buffer(torch.zeros(n_output))
         if force_std is not None:
             self.output_factor[FORCE_OUTPUTS] = 0.0
             self.output_offset[LOG_FORCE_STD] = np.log(force_std / domain.scale[2])
 
         # Whitening. The rows of `principal_axes` are orthonormal. The standard deviation of the features along an axis
-        # is the singular value divided by the square root of the number of presses.
-        values = feature_values(features, torch.tensor(charge, dtype=torch.float64))
-        mean = values.mean(dim=0)
-        _, singular_values, principal_axes = torch.linalg.svd(values - mean, full_matrices=False)
-        inverse_std = len(values) ** 0.5 / singular_values.clamp(min=torch.finfo(values.dtype).eps)
+        # is the singular value divided by the square root of the number of presses. `eps` prevents a division by zero.
+        press_features = feature_values(features, torch.tensor(charge, dtype=torch.float64))
+        mean = press_features.mean(dim=0)
+        _, singular_values, principal_axes = torch.linalg.svd(press_features - mean, full_matrices=False)
+        inverse_std = len(press_features) ** 0.5 / singular_values.clamp(min=torch.finfo(press_features.dtype).eps)
         self.features_mean = nn.Buffer(mean.float())
         self.whitening = nn.Buffer((principal_axes.T * inverse_std).float())
 
@@ -263,7 +267,11 @@ class InverseNetwork(nn.Module):
 
 
 def feature_values(features: ChargeFeatures, charge: Tensor) -> Tensor:
-    """Compute the features of charges, pC. Charges and features have the shape (n, n_electrode)."""
+    """Compute the features of charges, pC. Charges and features have the shape (n, n_electrode).
+
+    The features are ln(Q / typical charge) for positive charges, or asinh(Q / typical charge) - mean for charges of
+    both signs. The charges Q are first limited to a range.
+    """
 
     def constant(values: Array) -> Tensor:
         """Return an array as a tensor with the number type of the charges."""
@@ -298,21 +306,23 @@ def as_tensor(values: Reals) -> Tensor:
 def fold_network(network: InverseNetwork) -> FoldedNetwork:
     """Return a trained network whose perceptrons include the whitening of the inputs and the units of the answers.
 
-    If all presses have the same force, the last layer of the contact perceptron always gives this force.
+    The perceptrons of the result compute the answers directly from the features. The function `fold` includes maps
+    before and after a perceptron in its layers.
     """
-    mean = _to_numpy(network.features_mean)
-    matrix = _to_numpy(network.whitening)
-    factor = _to_numpy(network.output_factor)
+    features_mean = _to_numpy(network.features_mean)
+    whitening = _to_numpy(network.whitening)
+    output_factor = _to_numpy(network.output_factor)
     answer_map = linear_answer_map(network.domain)
-    # The answers are (outputs * factor + offset) @ weight + bias, which is one linear map of the outputs.
-    offset_answers = _to_numpy(network.output_offset) @ answer_map.weight + answer_map.bias
-    contact_map = Layer(factor[:, None] * answer_map.weight, offset_answers)
+    # The answers are (outputs * factor + offset) @ weight + bias, which is one linear map of the outputs. If the force
+    # is not learned, the factor and the offset make the outputs for the force constant.
+    answers_of_zero_outputs = _to_numpy(network.output_offset) @ answer_map.weight + answer_map.bias
+    outputs_to_answers = Layer(output_factor[:, None] * answer_map.weight, answers_of_zero_outputs)
     n_electrode = network.features.n_electrode
-    misfit_map = Layer(np.eye(n_electrode), np.zeros(n_electrode))
+    identity = Layer(np.eye(n_electrode), np.zeros(n_electrode))  # the misfit vector is already an answer
     return FoldedNetwork(
         features=network.features,
-        contact=fold(network.contact.to_numpy(), mean, matrix, contact_map),
-        misfit=fold(network.misfit_vector.to_numpy(), mean, matrix, misfit_map),
+        contact=fold(network.contact.to_numpy(), features_mean, whitening, outputs_to_answers),
+        misfit=fold(network.misfit_vector.to_numpy(), features_mean, whitening, identity),
     )
 
 

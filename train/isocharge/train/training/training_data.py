@@ -114,12 +114,13 @@ def invertible_domain(
     """Find the disk on which a network can be trained, and write sentences for the user about ambiguous contacts.
 
     At a fold, the map from contacts to charges turns back, so that contacts on both sides of the fold have the same
-    charges. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and a sentence states this.
-    If there is no such fold, the disk is the domain of the field. If a poor fit shows a probable fold, a sentence
-    states this, too.
+    charges. There are three cases. Without a fold, the disk is the domain of the field. If the fit is poor, its folds
+    are not certain, and the disk is also the domain of the field. A sentence then states a fold that is not near the
+    edge and is therefore probable. If an accurate fit shows a fold, the disk is reduced to the radius of the fold, and
+    a sentence states this.
 
     Args:
-        field: Charge field that was fitted to the presses.
+        field: Charge field that was fitted to the presses. `field.charge_std` is the relative error of the fit.
         presses: Presses to which the field was fitted. A sentence states how many of them lie in the disk.
         noise: Noise of good presses. Charges that differ by less than the noise count as equal.
 
@@ -131,32 +132,32 @@ def invertible_domain(
     """
     requested_radius = field.domain.radius
     area = working_area(within(field, SEARCHED_RADIUS_RATIO * requested_radius), noise, search_pairs=False)
-    fold_radius = area.unambiguous_radius  # rounded down
+    safe_radius = area.unambiguous_radius  # the smaller of the fold and the searched radius, rounded down
     if not np.isfinite(area.fold_radius):  # no fold in the domain
         return field.domain, ()
     if field.charge_std > MAX_ERROR_OF_CERTAIN_FOLD:
         probable_fold = (
-            f"the map from contacts to charges probably folds beyond about {fold_radius:.2g} mm: two contacts give the "
+            f"the map from contacts to charges probably folds beyond about {safe_radius:.2g} mm: two contacts give the "
             f"same charges there, and the model, which is trained for {requested_radius:g} mm, confuses them; a fit "
             f"with an error of {100.0 * field.charge_std:.2g} % does not show where: choose a smaller radius, or add "
             "an electrode; in a dataset, more presses of one probe may show it"
         )
-        cautions = (probable_fold,) if fold_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
+        cautions = (probable_fold,) if safe_radius < PROBABLE_FOLD_RATIO * requested_radius else ()
         return field.domain, cautions
 
-    if fold_radius < MIN_RADIUS_RATIO * requested_radius:
+    if safe_radius < MIN_RADIUS_RATIO * requested_radius:
         raise DatasetError(
-            f"the map from contacts to charges folds {fold_radius:g} mm from the centre, of {requested_radius:g} mm "
+            f"the map from contacts to charges folds {safe_radius:g} mm from the centre, of {requested_radius:g} mm "
             "asked for: beyond, two contacts give the same charges; choose a smaller radius, add an electrode, or take "
             "a biaxial film"
         )
     certain_fold = (
-        f"the map from contacts to charges folds beyond {fold_radius:g} mm: two contacts give the same charges there; "
-        f"the model is trained for {fold_radius:g} mm, not {requested_radius:g} mm, on "
-        f"{len(presses.within(fold_radius))} of {len(presses)} presses; 'serve stream --track' follows contacts to "
+        f"the map from contacts to charges folds beyond {safe_radius:g} mm: two contacts give the same charges there; "
+        f"the model is trained for {safe_radius:g} mm, not {requested_radius:g} mm, on "
+        f"{len(presses.within(safe_radius))} of {len(presses)} presses; 'serve stream --track' follows contacts to "
         f"{requested_radius:g} mm"
     )
-    return field.domain.within(fold_radius), (certain_fold,)
+    return field.domain.within(safe_radius), (certain_fold,)
 
 
 @dataclass(frozen=True)
@@ -186,18 +187,19 @@ class Split:
     def by_position(cls, data: TrainingData, training: TrainingConfig) -> "Split":
         """Split presses into a part for training and a part for the test, and fit a charge field to the presses.
 
-        A charge field is a smooth map from contacts to charges. The map folds where different contacts have the same
-        charges. The field determines the largest disk in which the map certainly does not fold. Only the presses within
-        this disk are used.
+        All presses of one position are in the same part. A charge field is a smooth map from contacts to charges. If
+        the data contain a field, no field is fitted. The field folds where it turns back, so that contacts on both
+        sides have the same charges. If a fold is certain, only the presses within the disk up to the fold are used.
 
         Args:
             data: Presses of the sensor.
             training: Fractions of the presses, noise and seed.
         """
-        # Fit the field to presses of the whole requested domain, and determine the domain without folds.
+        # Fit the field to presses of the whole requested domain, unless the data contain it. Determine the domain
+        # without folds, and sentences for the user about folds (`cautions`).
         presses = data.presses
         train, test = split_by_position(presses, training.hold_out)
-        noise = misfit_noise(training.noise_model)
+        noise = misfit_noise(training.noise_model)  # the noise of the training, or `reference` if it has none
         whole_field = data.field or fit_charge_series(
             data.domain, data.sensor.electrode_names, train, test, noise.white
         )
@@ -205,7 +207,8 @@ class Split:
         if domain == data.domain:
             return cls(domain, train, test, whole_field, cautions, folded_charges=None)
 
-        # The map folds. Use only the presses within the smaller domain.
+        # The field folds. Use only the presses within the smaller domain. The whole field with its folds is kept, too,
+        # so that a service can track contacts beyond the fold.
         train, test = split_by_position(presses.within(domain.radius), training.hold_out)
         field = within(whole_field, domain.radius)
         return cls(domain, train, test, field, cautions, folded_charges=replace(whole_field, is_folded=True))
@@ -224,7 +227,7 @@ class Split:
         has_both_signs = self.train.has_nonpositive_charges or self.test.has_nonpositive_charges
         if not has_both_signs:
             return logarithmic_features(charge, noise.white)
-        channel_noise = ChannelNoise.alike(noise)
+        channel_noise = ChannelNoise.alike(noise)  # the same noise on every electrode
         # The typical charge is `SIGNED_FEATURE_SCALE` times the transition charge, above which the noise is
         # proportional to the charge. The transition charge is proportional to the white noise, but has a lower limit.
         # The white noise is multiplied instead of the transition charge, so that the limit remains.
