@@ -65,6 +65,7 @@ def report_command(
     # Find the datasets and, for each of them, the model to compare.
     if model and len(model) != len(datasets):
         raise InputError(f"--model: expected one model for each of {len(datasets)} datasets, got {len(model)}")
+    # Both options are only for files of measured presses, so without a file they have no effect.
     for option, value in (("--sensor", sensor), ("--probe", probe)):
         if value is not None and all(path.is_dir() for path in datasets):
             raise InputError(f"{option} {value}: the dataset folders contain sensor and probes; leave {option} out")

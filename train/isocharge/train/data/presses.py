@@ -243,6 +243,7 @@ def presses_of(dataset: Dataset, fewest: int = MIN_PRESSES) -> LabelledPresses:
             the charge of an electrode never varies.
     """
     presses = LabelledPresses.of(dataset.samples)
+    # The position of a press is its place (x, y).
     n_position = place_count(presses.contact)
     if len(presses) < fewest or n_position < MIN_PLACES:
         raise DatasetError(
