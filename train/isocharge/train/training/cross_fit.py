@@ -226,8 +226,8 @@ def usable_presses(presses: MeasuredPresses) -> MeasuredPresses:
         presses = replace(presses, contact=assumed_contact, force_std=np.ones(len(presses)))
     check_known_columns(presses)
     usable = presses[complete(presses)]  # the place, the force and all charges of each press are known
-    # Positions that differ by at most the errors of an encoder become one position. Only for counting the places,
-    # positions that differ by their stated standard deviations also count as one place.
+    # Positions that differ only by the small errors of an encoder become one position. In the count of places below,
+    # positions that differ by little more than their standard deviations also count as one place.
     usable = replace(usable, contact=merged_places(usable.contact))
     usable_places = place_count(merged_uncertain_places(usable))
     if len(usable) < MIN_PRESSES or usable_places < MIN_PLACES:
@@ -379,7 +379,7 @@ def _cross_validate(
         fold_config = structs.replace(config, seed=config.seed + fold_index)
         contact_stage(network, presses[~is_in_fold], added_noise, fold_config).run()  # trains the network in place
 
-        # `fold_network` includes the scaling of inputs and outputs in the layers, and has nothing to do with the fold.
+        # `fold_network` includes the scaling of inputs and outputs in the layers. Its name does not mean these folds.
         contact, std, *_ = fold_network(network).outputs(presses.charge[is_in_fold])
         answers.contact[is_in_fold] = contact
         answers.std[is_in_fold] = std
