@@ -93,8 +93,8 @@ def divide_intervals(ends: Array, count: int) -> Array:
 def lagrange_values(nodes: Array, points: Array) -> Array:
     """Evaluate the Lagrange polynomials of given nodes.
 
-    The polynomial of a node is 1 at this node and 0 at all other nodes. At a point x, the polynomial is the product of
-    (x - y) / (node - y) over all other nodes y.
+    The polynomial of a node z is 1 at this node and 0 at all other nodes. At a point x, the polynomial is the product
+    of (x - y) / (z - y) over all other nodes y.
 
     Args:
         nodes: Interpolation nodes, shape (n,).
@@ -103,11 +103,11 @@ def lagrange_values(nodes: Array, points: Array) -> Array:
     Returns:
         Value of each polynomial at each point, shape (m, n). Each row adds up to one.
     """
-    # Each node y contributes the factor (x - y) / (node - y) to the polynomials of all other nodes.
+    # Each node y contributes the factor (x - y) / (z - y) to the polynomials of all other nodes z.
     values = np.ones((points.size, nodes.size))
-    for index, node in enumerate(nodes):
+    for index, y in enumerate(nodes):
         is_other = np.arange(nodes.size) != index
-        factors = (points[:, None] - node) / (nodes[is_other] - node)
+        factors = (points[:, None] - y) / (nodes[is_other] - y)
         values[:, is_other] *= factors
     return values
 
@@ -263,7 +263,8 @@ class Turns:
         """Choose the smallest number of turns whose presses determine the coefficients of a Fourier series.
 
         A turn is a pair of two angles: the rotation r of the probe relative to the direction of a press, and the sum d
-        of this direction and the rotation. The term (m, k) of the series is proportional to exp(i (2 m d + k r)).
+        of this direction and the rotation. The attribute `direction` contains the sum d. The term (m, k) of the series
+        is proportional to exp(i (2 m d + k r)).
 
         Args:
             largest_harmonics: Largest |k| of the terms of the series for |m| = 0, 1, 2, and so on. If the direction
@@ -281,11 +282,12 @@ class Turns:
             terms.extend((m, k) for k in range(-largest_k, largest_k + 1))
         term_orders = np.array(terms)  # shape (n_term, 2)
 
-        # Choose the angles. From each turn to the next, the angle r increases by an n-th part of a full turn, and d by
-        # a multiple of an n-th part of half a turn. Half a turn is the period of d, because only even harmonics occur.
+        # Choose the smallest number of turns for which no two terms have the same values at all turns. From each turn
+        # to the next, the rotation r increases by 2 pi / n_turn, and the sum d increases by step * pi / n_turn, where
+        # `step` is an integer. The angle pi is the period of d, because only even harmonics occur.
         symmetry_order = round(math.tau / period) if has_rotations else 1
         n_turn, step = _smallest_lattice(term_orders, symmetry_order)
-        turn = np.arange(n_turn)
+        turn = np.arange(n_turn)  # index of each turn
         return cls(
             direction=np.pi * step * turn / n_turn if has_directions else np.zeros(n_turn),
             rotation=math.tau * turn / n_turn if has_rotations else np.zeros(n_turn),
@@ -341,31 +343,35 @@ def _smallest_lattice(term_orders: Integers, symmetry_order: int) -> tuple[int, 
 
         r = 2 pi j / n   and   d = pi s j / n   for j = 0, 1, ..., n - 1.
 
-    The term (m, k) of the series therefore has the value
+    The function returns the smallest n, and a step s, that satisfy two conditions:
 
-        exp(i (2 m d + k r)) = exp(2 pi i (m s + k) j / n)
+    1. The remainders of m s + k modulo n are different for all terms (m, k).
+    2. Both n and s - 2 are multiples of the symmetry order q of the probe.
 
-    at the turn j. The value does not change if n is added to m s + k. If the division of m s + k by n leaves the same
-    remainder for two terms, the terms have the same values at all turns. Their coefficients can then not be
-    distinguished. The remainders of all terms must be different.
+    Reason for the first condition: at the turn j, the term (m, k) has the value
 
-    Presses are solved only at the turns within one period of the probe. The period of a probe with the symmetry order q
-    is 2 pi / q. In each further period, the directions d - r must be the same, or differ by half turns, which do not
-    change the film. During one period, d - r increases by pi s / q - 2 pi / q = pi (s - 2) / q. The difference s - 2
-    must therefore be a multiple of q.
+        exp(i (2 m d + k r)) = exp(2 pi i (m s + k) j / n).
+
+    If two terms had the same remainder, they would have the same values at all turns, and their coefficients could not
+    be distinguished.
+
+    Reason for the second condition: presses are solved only at the turns within one period 2 pi / q of the probe. The
+    turns of each further period must describe the same presses. Each period therefore contains the same number n / q of
+    turns. From one period to the next, the direction d - r of the press increases by pi s / q - 2 pi / q, which is
+    pi (s - 2) / q. This angle must be a multiple of half a turn (pi), because only half turns do not change the film.
 
     Args:
         term_orders: Pairs (m, k) of the terms, shape (n_term, 2).
         symmetry_order: Order q of the rotational symmetry of the probe.
 
     Returns:
-        Number n of turns, which is a multiple of the symmetry order, and step s.
+        Number n of turns and step s.
     """
     n_term = len(term_orders)
-    smallest_step = 2 % symmetry_order  # s - 2 is a multiple of the symmetry order
-    n_turn = symmetry_order * math.ceil(n_term / symmetry_order)  # different remainders need at least n_term turns
+    smallest_step = 2 % symmetry_order  # the smallest s >= 0 for which s - 2 is a multiple of q
+    n_turn = symmetry_order * math.ceil(n_term / symmetry_order)  # n different remainders need at least n_term turns
     while True:  # ends, because all remainders are different if there are sufficiently many turns
-        for step in range(smallest_step, n_turn, symmetry_order):  # larger steps have the same remainders
+        for step in range(smallest_step, n_turn, symmetry_order):  # s and s + n have the same remainders
             remainders = (term_orders @ (step, 1)) % n_turn  # of m s + k
             if len(set(remainders.tolist())) == n_term:
                 return n_turn, step

@@ -128,7 +128,8 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
 
     A bilinear function maps the points of the rule for the unit square into each quadrilateral. The weights are
     multiplied by the determinant of the Jacobian of the bilinear function. For a line, the determinant is zero. The
-    weights of a line are therefore multiplied by the area that the line represents.
+    weights of a line are therefore multiplied by the area that the line represents. Lines occur if a mean over the
+    edges of an electrode replaces the mean over its area.
 
     Args:
         corners: Corners x + iy, anticlockwise, shape (n, 4). The last two corners of a triangle are equal. In a line,
@@ -140,7 +141,8 @@ def gauss_quadrilaterals(corners: Complexes, line_area: Array, count: int) -> tu
         Points x + iy, and weights, each of shape (n, count^2). The weights add up to the area of the quadrilateral or
         to the area that the line represents.
     """
-    # Coordinates s and t, and weights of the points in the unit square, each of shape (count^2,)
+    # Coordinates t and s, and weights of the points in the unit square, each of shape (count^2,). The rule is symmetric
+    # in both coordinates. The first coordinate of `tensor_rule`, which is t here, varies fastest.
     t, s, square_weights = tensor_rule(*gauss_line(count))
 
     # Map the points into the quadrilaterals. The digits in the name of a corner are its coordinates s and t.
@@ -259,6 +261,7 @@ def trace_outline(path: Complexes, width: float) -> Complexes:
         normal_before = np.append(normals[:1], normals)
         normal_after = np.append(normals, normals[-1:])
         one_plus_cosine = 1.0 + (normal_before * np.conj(normal_after)).real
+        # `MIN_BEND` is the smallest allowed value of 1 + cosine, because the mitre becomes very long at a sharp bend.
         one_plus_cosine = np.where(one_plus_cosine < MIN_BEND, np.nan, one_plus_cosine)
         mitre = 0.5 * width * (normal_before + normal_after) / one_plus_cosine
     right_side = path - mitre
