@@ -53,7 +53,7 @@ class BackPressure:
             Energy, dimensionless. The energy is infinite if the film displaces the whole volume of the air.
         """
         volume = self._volume(deflection)
-        energy = -self.groups.static_pressure * volume
+        energy = -self.groups.static_pressure * volume  # minus the work of the static pressure
         if self.groups.compression != 0.0:
             displaced_share = self._displaced_share(deflection)
             if displaced_share >= 1.0:

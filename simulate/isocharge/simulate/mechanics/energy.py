@@ -61,7 +61,7 @@ class ElasticFilm:
         has_back_pressure = groups.static_pressure != 0.0 or groups.compression != 0.0
         self.back_pressure = BackPressure(mesh, groups) if has_back_pressure else None
 
-        # The load of the mesh contains the share of each node in the force of the probe.
+        # `mesh.load` is the share of each node in the force. Each share is multiplied by the force along U1, U2 and W.
         self.probe_force = np.outer(mesh.load, [*groups.side_load, groups.load])
 
     @property
@@ -113,7 +113,7 @@ class ElasticFilm:
             element_forces: Internal forces of the elements, shape (n_element, n_local, 3).
 
         Returns:
-            Forces along (U1, U2, W), shape (n_node, 3).
+            Internal minus external forces along (U1, U2, W), shape (n_node, 3).
         """
         residual = np.stack([self.mesh.gather(element_forces[..., i]) for i in range(3)], axis=1)
         residual -= self.probe_force
@@ -181,8 +181,8 @@ class Membrane:
         """
         self.mesh = mesh
         self.groups = groups
-        # Weights of the squared slopes of U1, U2 and W in the strain, shape (3,)
-        self._slope_weights = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
+        # Factors of the squared slopes of U1, U2 and W in the strain: (A^2, A^2, 1) with the amplitude A of the press
+        self._slope_factors = np.array([groups.squared_amplitude, groups.squared_amplitude, 1.0])
         # Pretension in units of E_young A^2, as stress (T11, T22, T12) and as a symmetric matrix
         self._pretension = groups.tension * EQUAL_TENSION + groups.uneven_tension
         self._pretension_matrix = _symmetric_matrix(self._pretension)
@@ -213,7 +213,7 @@ class Membrane:
         Returns:
             Components F_ia, shape (..., 2, 3). The last two axes are the indices a and i.
         """
-        deformation: Array = slopes * self._slope_weights
+        deformation: Array = slopes * self._slope_factors
         deformation[..., 0, 0] += 1.0
         deformation[..., 1, 1] += 1.0
         return deformation
@@ -231,17 +231,17 @@ class Membrane:
         Returns:
             Energy of the meshed part of the film, dimensionless.
         """
-        # The last two axes are the coordinate and the displacement component, shape (n_element, n_point, 2, 3).
-        slopes = self._slopes(field)
+        slopes = self._slopes(field)  # shape (n_element, n_point, 2, 3): coordinate and displacement component
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
         scaled_stress = scaled_strain @ self.groups.elasticity
         elastic_density = 0.5 * np.sum(scaled_strain * scaled_stress, axis=-1)
 
-        # The linear part of E' is sym grad U. The remainder is the sum of weight_i U_i,a U_i,b / 2 over the
-        # displacement components i, where U_3 = W, and U_i,a is the slope of U_i along the coordinate a. The energy
-        # density of the pretension is therefore the sum of weight_i U_i,a T_ab U_i,b / 2 over a, b and i.
-        products_by_component = slopes * (self._pretension_matrix @ slopes)
-        pretension_density = 0.5 * np.sum(products_by_component @ self._slope_weights, axis=-1)
+        # Let U_i,a be the slope of the displacement component U_i along the coordinate a, where U_3 = W. The linear
+        # part of E' is sym grad U. The remainder is the sum of factor_i U_i,a U_i,b / 2 over i, with the factors A^2
+        # for U1 and U2 and 1 for W, where A is the amplitude of the press. The energy density of the pretension is
+        # therefore the sum of factor_i U_i,a T_ab U_i,b / 2 over a, b and i.
+        products_by_component = slopes * (self._pretension_matrix @ slopes)  # U_i,a T_ab U_i,b, summed over b
+        pretension_density = 0.5 * np.sum(products_by_component @ self._slope_factors, axis=-1)
         return float(np.sum((elastic_density + pretension_density) * self.mesh.weights))
 
     def forces(self, field: Array) -> Array:
@@ -256,12 +256,12 @@ class Membrane:
         mesh = self.mesh
         slopes = self._slopes(field)
         scaled_strain = strain(slopes, self.groups.squared_amplitude)
-        elastic_stress = scaled_strain @ self.groups.elasticity
+        elastic_stress = scaled_strain @ self.groups.elasticity  # (S11, S22, S12), shape (n_element, n_point, 3)
 
         # The traction is the derivative of the energy density with respect to the slopes, shape (n_element, n_point, 2,
-        # 3). The terms of the traction belong to the elastic stress and to the pretension.
+        # 3). Add the terms of the elastic stress and of the pretension. A^2 is the squared amplitude of the press.
         traction = _symmetric_matrix(elastic_stress) @ self._deformation_gradient(slopes)
-        traction += self._slope_weights * (self._pretension_matrix @ slopes)
+        traction += self._slope_factors * (self._pretension_matrix @ slopes)  # factors A^2 for U1 and U2, and 1 for W
 
         # Integrate the product of the traction and the derivatives of the basis functions over each element.
         weighted_traction = traction * mesh.weights[..., None, None]
@@ -292,8 +292,9 @@ class Membrane:
         slopes = self._slopes(field)
 
         # Compute the two parts of S, multiplied by the integration weights of the points. One part is caused by the
-        # stress (S11, S22, S12), which is the sum of the elastic stress and the pretension. The other part is the
-        # stiffness of the material.
+        # stress (S11, S22, S12), which is the sum of the elastic stress, the pretension and the added tension. An equal
+        # tension in all directions is the stress (1, 1, 0). The other part is the stiffness of the material. The last
+        # four axes of the stiffness are the coordinate and the component of one slope, followed by those of another.
         elastic_stress = strain(slopes, self.groups.squared_amplitude) @ self.groups.elasticity
         total_stress = elastic_stress + self._pretension + added_tension * EQUAL_TENSION
         weighted_stress = _symmetric_matrix(total_stress * mesh.weights[..., None])  # (n_element, n_point, 2, 2)
@@ -309,10 +310,11 @@ class Membrane:
         matrix = np.zeros((n_element, unknowns_per_node, n_local, unknowns_per_node, n_local))
         for i, j in combinations_with_replacement(range(3), 2):
             # S for the slopes of the components i and j, shape (n_element, n_point, 2, 2). The stress contributes only
-            # if i = j, because the strain contains no products of slopes of different components.
+            # if i = j, because the strain contains no products of slopes of different components. The squared slopes of
+            # a component have a factor in the strain: A^2 for U1 and U2, and 1 for W, with the amplitude A.
             slope_stiffness = weighted_stiffness[..., i, :, j].copy()
             if i == j:
-                slope_stiffness += self._slope_weights[i] * weighted_stress
+                slope_stiffness += self._slope_factors[i] * weighted_stress
 
             # In S G, the points and the coordinates are stacked like in G'. The product with G' sums over all of them.
             stacked_product = (slope_stiffness @ gradient).reshape(n_element, -1, n_local)
@@ -337,7 +339,7 @@ class Membrane:
             displacement component of the first slope, followed by the coordinate and the displacement component of the
             second slope.
         """
-        strain_derivative = np.zeros((*deformation.shape, 3))
+        strain_derivative = np.zeros((*deformation.shape, 3))  # last axis: E11, E22, 2 E12
         strain_derivative[..., 0, :, 0] = deformation[..., 0, :]  # d E11 / d U_i,1
         strain_derivative[..., 1, :, 1] = deformation[..., 1, :]  # d E22 / d U_i,2
         strain_derivative[..., 0, :, 2] = deformation[..., 1, :]  # d 2 E12 / d U_i,1
@@ -379,9 +381,8 @@ class Bending:
 
     where K is the matrix without bending and s is a shift. The solution W does not depend on the shift, because the
     Schur complement is K + beta L^T M^-1 L for every shift. The lowest eigenvalue of the negative Laplacian on the film
-    is 5.78. If the shift lies between 0 and twice the lowest eigenvalue, the first block of the matrix is positive
-    definite. The first block is positive definite even if K is zero, as in a thick film without tension. The complete
-    matrix is therefore quasi-definite, and can be factorised without pivoting (Vanderbei 1995).
+    is 5.78. If the shift lies between 0 and twice this value, the first block is positive definite, even if K is zero.
+    The complete matrix is then quasi-definite, and can be factorised without pivoting (Vanderbei 1995).
 
     A node in the interior of an element belongs to no other element, and M is diagonal. The unknowns mu of the interior
     nodes of each element are therefore eliminated before the matrix is assembled.
@@ -406,22 +407,23 @@ class Bending:
     def _system_blocks(self) -> tuple[Array, Array, Array]:
         """Blocks (W, W), (W, mu) and (mu, mu) of the linear system, each of shape (n_element, n_local, n_local).
 
-        The docstring of the class describes the linear system. The unknowns mu of interior nodes are eliminated. The
-        Schur complement of their equations is added to the block (W, W), and the coupling of these unknowns is zero.
+        The class describes the linear system for the deflection W and an auxiliary unknown mu. L is the matrix of the
+        weak Laplacian, M is the mass matrix, beta is the bending stiffness, and s is a shift. The unknowns mu of
+        interior nodes are eliminated: their Schur complement is added to the block (W, W), and their coupling is zero.
         """
         mesh = self.mesh
         mass = np.eye(mesh.template.xi.size) * mesh.node_weights[:, None]  # M
         coupling = np.sqrt(self.stiffness) * (self._laplace - BENDING_SHIFT * mass)  # sqrt(beta) (L - s M), symmetric
-        shifted_laplace = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
-        deflection_block = self.stiffness * shifted_laplace
+        shift_terms = 2.0 * BENDING_SHIFT * self._laplace - BENDING_SHIFT**2 * mass  # 2 s L - s^2 M
+        deflection_block = self.stiffness * shift_terms
 
         # Eliminate the unknowns mu of interior nodes. With their block -M, which is diagonal, and their coupling B, the
         # Schur complement is -B' (-M)^-1 B = B' M^-1 B.
         interior = mesh.template.is_interior
-        interior_coupling = coupling[:, interior]  # shape (n_element, n_interior, n_local)
+        interior_coupling = coupling[:, interior]  # B, shape (n_element, n_interior, n_local)
         interior_mass = mesh.node_weights[:, interior, None]
         deflection_block += interior_coupling.transpose(0, 2, 1) @ (interior_coupling / interior_mass)
-        coupling[:, interior] = 0.0
+        coupling[:, interior] = 0.0  # the rows of `coupling` belong to mu, but those of the returned block to W
         return deflection_block, coupling.transpose(0, 2, 1), -mass
 
     def laplacian(self, deflection: Array) -> Array:
@@ -477,17 +479,15 @@ class Bending:
             [ sqrt(beta) (L - s M)        -M                     ] [mu] = [0],
 
         where r is the right-hand side for W, beta is the bending stiffness, L is the matrix of the weak Laplacian, and
-        M is the diagonal mass matrix. If mu is eliminated, the matrix K + beta L^T M^-1 L remains for W. The solution W
-        therefore does not depend on the shift s. With the shift `BENDING_SHIFT`, the complete matrix can be factorised
-        without pivoting. The unknowns mu of the interior nodes have already been eliminated from the blocks that this
-        method adds.
+        M is the diagonal mass matrix. The solution W does not depend on the shift s. The unknowns mu of the interior
+        nodes of the elements have already been eliminated from the blocks that this method adds to K.
 
         Args:
             tangent: Matrices for (U1, U2, W, mu), shape (n_element, 4, n_local, 4, n_local). The entries that belong to
                 mu are zero before the call.
         """
         # The indices of the unknowns of a node are 0 for U1, 1 for U2, 2 for W and 3 for mu.
-        deflection_block, coupling, auxiliary_block = self._system_blocks
+        deflection_block, coupling, auxiliary_block = self._system_blocks  # in (W, W), (W, mu) and (mu, mu)
         tangent[:, 2, :, 2] += deflection_block
         tangent[:, 2, :, 3] = coupling
         tangent[:, 3, :, 2] = coupling.transpose(0, 2, 1)

@@ -126,6 +126,7 @@ def elasticity(film: Film, angle: float) -> Array:
     )
 
     # Compute the difference from an isotropic film in the axes of the film. The coupling is the same in both films.
+    # The last row and column belong to the shear. All entries are divided by Young's modulus.
     root_of_ratio = np.sqrt(film.young_ratio)  # r
     difference_11 = plane_modulus * (root_of_ratio - 1.0)
     difference_22 = plane_modulus * (1.0 / root_of_ratio - 1.0)
@@ -254,7 +255,8 @@ class DimensionlessGroups:
         deviator = np.array([half_difference, -half_difference, shear_tension])
         tension_unit = film.young * squared_amplitude
 
-        # The unit of the displaced volume is a^3 A. The compression is this unit divided by the volume of the air.
+        # The unit of the displaced volume is a^3 A. The compression is the unit of the displaced volume divided by the
+        # volume of the air behind the film. It is zero if the back of the film is vented.
         compression = 0.0
         if film.back_volume is not None:
             compression = film.radius**3 * squared_amplitude**0.5 / film.back_volume
@@ -300,7 +302,8 @@ class DimensionlessGroups:
         H = p / (4 tension) for a membrane with a large pretension, and H = p / (64 bending) for a plate.
         """
         # The cubic equation is cubic_factor H^3 + linear_factor H = p. The trapped air also resists the deflection. The
-        # displaced volume is about pi H / 2, the volume of a paraboloid with the height H and the radius 1.
+        # displaced volume is about pi H / 2, the volume of a paraboloid with the height H and the radius 1. The
+        # pressure of the air rises by the ambient pressure times the displaced share, compression * pi H / 2.
         air_stiffness = 0.5 * np.pi * self.ambient_pressure * self.compression
         linear_factor = 4.0 * max(self.tension, 0.0) + 64.0 * self.bending + air_stiffness
         cubic_factor = 1.0 / 0.662**3

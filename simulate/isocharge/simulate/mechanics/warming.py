@@ -39,11 +39,12 @@ def tension_change(film: Film, film_warming_K: float, ring_warming_K: float) -> 
         return np.zeros(3)
     free_strain = np.array(film.expansion) * film_warming_K  # along the axes 1 and 2 of the film
     ring_strain = film.ring_expansion * ring_warming_K
-    elastic_strain = np.append(ring_strain - free_strain, 0.0)  # (E11, E22, 2 E12)
-    # A matrix product may round the stresses along both axes differently, even if the film is isotropic. This sum of
-    # products rounds them equally.
+    elastic_strain = np.append(ring_strain - free_strain, 0.0)  # (E11, E22, 2 E12) in the axes of the film
+    # `elasticity` returns the stiffness matrix, divided by Young's modulus, in the axes at a given angle from the x
+    # axis. These are the axes of the film here. The sum of products is the matrix times the strain. A matrix product
+    # may round the stresses along both axes differently, and an isotropic film would then not remain axisymmetric.
     change_in_film_axes = film.young * (elastic_strain * elasticity(film, film.axis)).sum(axis=1)
-    return rotate_stress(change_in_film_axes, film.axis)
+    return rotate_stress(change_in_film_axes, film.axis)  # from the axes of the film into the axes x and y
 
 
 MAX_WARMING_K = 150.0
@@ -55,11 +56,13 @@ def warming_limits(film: Film) -> tuple[float, float]:
 
     If the film has expansion coefficients, its mean pretension must remain in the accepted range.
     """
-    change_per_K = tension_change(film, 1.0, 0.0)[:2].mean()  # of the mean pretension, MPa/K
+    # The mean pretension is the mean of T11 and T22.
+    change_per_K = tension_change(film, film_warming_K=1.0, ring_warming_K=0.0)[:2].mean()  # MPa/K
     if change_per_K == 0.0:
         return -MAX_WARMING_K, MAX_WARMING_K
-    accepted = FILM_NUMBERS["pretension"]
-    changes = np.array([accepted.smallest, accepted.largest]) - film.pretension
+    pretension_range = FILM_NUMBERS["pretension"]
+    changes = np.array([pretension_range.smallest, pretension_range.largest]) - film.pretension
+    # If a warmer film has less pretension, the smallest pretension belongs to the largest warming.
     low, high = np.clip(np.sort(changes / change_per_K), -MAX_WARMING_K, MAX_WARMING_K).tolist()
     return low, high
 
