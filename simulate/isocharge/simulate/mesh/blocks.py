@@ -99,20 +99,23 @@ class Blocks:
         """
         self.resolution = resolution
         self.topology = topology
-        # A press with a footprint that fills the innermost circle is symmetric, so half of the film is sufficient.
+        # A footprint that fills the innermost circle is a circle. On an axisymmetric film, a press with a circular
+        # footprint is symmetric about the line from the centre to the press, so a mesh of half of the film suffices.
         self.half = topology.fills_circle and not whole
 
         # The core polygon is divided into one quadrilateral for each corner. A quadrilateral consists of n_half_edge *
         # n_half_edge elements. At each corner, two half edges meet. Each element along the edges begins a sector
-        # outside the core polygon.
+        # outside the core polygon. `around` is the requested number of sectors around the whole innermost circle. The
+        # property `copies` is 2 if only half of the film is meshed, and 1 otherwise.
         self.n_corner = topology.n_corner
         self.n_half_edge = max(1, round(resolution.around / (2 * self.n_corner)))
         self.n_meshed_corner = self.n_corner // self.copies
         self.n_sector = 2 * self.n_meshed_corner * self.n_half_edge
-        self.n_quad = self.n_meshed_corner * self.n_half_edge**2
+        self.n_quad = self.n_meshed_corner * self.n_half_edge**2  # number of elements in the core polygon
 
         # Count the elements inside the innermost circle, and then all elements including the rings. There are two
-        # layers if the boundary of the footprint is a curve between the core polygon and the innermost circle.
+        # layers if the boundary of the footprint is a curve between the core polygon and the innermost circle. The thin
+        # rings at the rim (`rim`) are counted in addition to the other rings (`rings`).
         self.n_layer = 2 if topology.is_curved and not topology.fills_circle else 1
         self.n_inner = self.n_quad + self.n_layer * self.n_sector
         self.n_ring = resolution.rings + resolution.rim
@@ -149,6 +152,9 @@ class Blocks:
     def half_edge_ends(self) -> Array:
         """Ends of all half edges of the core polygon in the meshed part, shape (2 * n_meshed_corner + 1, n_corner + 1).
 
+        The array contains weights, from which the ends are computed. If only half of the film is meshed, half of the
+        corners lie in the meshed part.
+
         The core polygon is the part of the footprint whose elements have straight sides. A half edge extends from a
         corner to the middle of an edge at this corner. The ends are listed anticlockwise along the boundary: the middle
         of the edge before the first corner, the first corner, the middle of the next edge, and so on. The last end is
@@ -178,40 +184,43 @@ class Blocks:
     def inner_corner_weights(self) -> Array:
         """Weights that describe the corners of the elements inside the innermost circle of the mesh.
 
-        The shape is (n_inner, 4, n_corner + 1). The four corners of an element are the first and the last corner of its
-        inner side, and the first and the last corner of its outer side. Each corner is a weighted sum of the corners
-        and the centroid of the core polygon. The weights of a corner on a curved side are zero, because
-        `Placement.sides` computes the curved sides.
+        The shape is (n_inner, 4, n_corner + 1). The first axis contains the `n_quad` elements of the core polygon,
+        followed by the elements of one or two layers around it, with `n_sector` elements in each layer. There are two
+        layers if the boundary of the footprint is a curve between the core polygon and the innermost circle.
 
-        The elements of the core polygon come first. The elements of one or two layers around the core polygon follow,
-        with `n_sector` elements in each layer.
+        The second axis contains the four corners of an element: the first and the last corner of its inner side, and
+        the first and the last corner of its outer side. Each of them is a weighted sum of the corners and the centroid
+        of the core polygon, whose weights are the last axis. The weights of a corner on a curved side are zero, because
+        `Placement.sides` computes the curved sides.
         """
         weights = np.zeros((self.n_inner, 4, self.n_corner + 1))
         weights[: self.n_quad] = self._core_element_corners()
 
-        # The first layer has a straight inner side on the core polygon, and an outer side that may be curved. Both
-        # sides of the second layer are curved.
+        # The first layer has a straight inner side on the core polygon, and an outer side that is curved. Both sides of
+        # the second layer are curved. The weights of curved sides remain zero.
         first_layer = weights[self.n_quad : self.n_quad + self.n_sector]
-        first_layer[:, 0] = self.core_outline[:-1]
-        first_layer[:, 1] = self.core_outline[1:]
+        first_layer[:, 0] = self.core_outline[:-1]  # first corner of the inner side
+        first_layer[:, 1] = self.core_outline[1:]  # last corner of the inner side
         return weights
 
     def _core_element_corners(self) -> Array:
         """Return the corners of the elements in the core polygon.
 
-        The core polygon is divided into one quadrilateral for each of its corners. The inner side of a quadrilateral
-        extends from the centroid of the core polygon to the middle of the edge after the corner. The outer side extends
-        from the middle of the edge before the corner to the corner. A quadrilateral is divided into a square grid of
-        n_half_edge * n_half_edge elements. All points are expressed by the weights of the corners and the centroid, as
-        in `half_edge_ends`.
+        The core polygon is divided into one quadrilateral for each of its corners. The vertices of a quadrilateral are
+        the centroid of the core polygon, the middle of the edge after the corner, the middle of the edge before the
+        corner, and the corner itself. Its inner side extends from the first vertex to the second vertex, and its outer
+        side from the third vertex to the fourth vertex. A quadrilateral is divided into a square grid of
+        n_half_edge * n_half_edge elements. Each point is a weighted sum of the corners and the centroid of the core
+        polygon, and is expressed by the weights of this sum.
 
         Returns:
             First and last corner of the inner side, and first and last corner of the outer side of each element, shape
-            (n_quad, 4, n_corner + 1). Each corner of an element is a weighted sum of the corners and the centroid of
-            the core polygon. The last axis contains the weights of this sum. The elements are ordered quadrilateral by
-            quadrilateral.
+            (n_quad, 4, n_corner + 1), where n_quad is the number of elements in the core polygon. The last axis
+            contains the weights. The elements are ordered quadrilateral by quadrilateral.
         """
         centroid = np.eye(self.n_corner + 1)[-1]  # has the weight 1 for itself
+        # `half_edge_ends` alternates: middle of an edge, corner, middle, ..., corner, middle. Only the corners in the
+        # meshed part of the film are included, whose number is n_meshed_corner.
         middles = self.half_edge_ends[::2]
         corners = self.half_edge_ends[1::2]
 
@@ -236,8 +245,9 @@ class Blocks:
         return by_quadrilateral.reshape(self.n_quad, 4, self.n_corner + 1)
 
     def rotated_elements(self, steps: int, steps_per_turn: int) -> Integers:
-        """Return the new numbers of the elements after a rotation of the probe, which must map the mesh onto itself.
+        """Return for each element the element whose place it takes after a rotation of the probe.
 
+        The rotation must map the mesh onto itself. Such a mesh covers the whole film.
         The mesh consists of the core polygon under the probe, and of layers and rings around it, which are divided into
         sectors. In the core polygon, all elements at one corner are numbered before the elements at the next corner.
         The sectors are numbered layer by layer and ring by ring, and anticlockwise within each layer or ring.
@@ -250,14 +260,16 @@ class Blocks:
             For each element, the index of the element that was at its new place before the rotation, shape
             (n_element,).
         """
-        # The rotation maps corners onto corners, so it is a rotation by a whole number of corners. At each corner, two
-        # half edges meet, and each element along them begins a sector.
+        # The rotation maps corners onto corners, so it is a rotation by a whole number of corners. For example, a
+        # quarter turn of a square shifts the corners by 1. At each corner, two half edges meet, and each of the
+        # n_half_edge elements along a half edge begins a sector. All corners are meshed.
         corner_shift = steps * self.n_corner // steps_per_turn
         sector_shift = 2 * self.n_half_edge * corner_shift
         core_elements = np.arange(self.n_quad).reshape(self.n_meshed_corner, -1)  # one row for each corner
         sectors = np.arange(self.n_quad, self.n_element).reshape(-1, self.n_sector)  # one row for each layer and ring
 
-        # Each element takes the place of the element that lies anticlockwise of it by the shift.
+        # Each element takes the place of the element that lies anticlockwise of it by the shift. This element comes
+        # later in the order of the elements, so the numbers are moved backwards.
         rotated_core = np.roll(core_elements, -corner_shift, axis=0)
         rotated_sectors = np.roll(sectors, -sector_shift, axis=1)
         return np.concatenate([rotated_core.ravel(), rotated_sectors.ravel()])

@@ -88,6 +88,8 @@ def enclosing_circle(outline: Complexes, centroid: Array) -> tuple[Array, Array]
         Position of the centre of each circle on the x axis, and radius of each circle, each of shape (...), in film
         radii.
     """
+    # The gap between the circle and the rim is at least `OUTER_GAP_SHARE` times the gap between the footprint and the
+    # rim. `_enclosing_radius` also limits the gap between the footprint and the circle to a share of `rim_gap`.
     rim_gap = 1.0 - np.abs(outline).max(axis=-1)  # between the footprint and the rim
     max_extent = 1.0 - OUTER_GAP_SHARE * rim_gap  # largest allowed x coordinate of a circle
     radius_at_centroid = _enclosing_radius(outline, centroid, rim_gap)
@@ -133,42 +135,44 @@ def sector_angles(
 ) -> Array:
     """Compute the angles at which the sides of the sectors meet the innermost circle of the mesh.
 
-    The innermost circle encloses the footprint of the probe. The centre of this circle lies on the line from the centre
-    of the film to the centroid of the footprint, but not always at the centroid. The sectors divide the rings between
-    this circle and the rim of the film. The sides of the sectors begin where rays from the centroid meet the circle.
+    The mesh is created in the template plane, which a conformal map converts into the film. The innermost circle of the
+    mesh encloses the footprint of the probe. The centre of this circle lies on the line from the centre of the film to
+    the centroid of the footprint, but not always at the centroid. The sectors divide the rings between this circle and
+    the rim of the film. The sides of the sectors begin where rays from the centroid meet the circle.
 
     Args:
-        blocks: The elements.
-        inner_points: Points x + iy on the inner boundary of the last layer inside the circle, shape
-            (..., 2 * n_meshed_corner + 1), in film radii. The points belong alternately to the middle of an edge and to
-            a corner of the core polygon.
+        blocks: Elements of the mesh, which determine the number of sectors.
+        inner_points: Points x + iy on the inner boundary of the outermost layer of elements inside the circle, shape
+            (..., 2 * n_meshed_corner + 1), in film radii. This boundary is the edge of the footprint, or of a polygon
+            in the footprint, the core polygon. The points belong alternately to the middle of an edge and to a corner
+            of the core polygon.
         centroid: Position of the centroid of the footprint on the x axis, shape (...), in film radii.
         centre: Position of the centre of the circle on the x axis, shape (...), in film radii.
         radius: Radius of the circle, shape (...), in film radii.
-        stretch: Factor that `stretch_angles` uses to convert angles on the circle into angles in the template plane,
-            shape (...).
+        stretch: Factor with which `stretch_angles` converts angles around the centre of the circle on the film into
+            angles in the template plane, shape (...).
 
     Returns:
-        Angles in the template plane in increasing order, shape (..., n_sector + 1), rad. The conformal map converts the
-        template plane into the film.
+        Angles in the template plane in increasing order, shape (..., n_sector + 1), rad.
     """
-    # Add an axis for the points or the rays.
+    # Add an axis for the points or the rays. The positions are real, because both points lie on the x axis.
     ray_origin = centroid[..., None]
     circle_centre = centre[..., None]
     circle_radius = radius[..., None]
 
-    # Choose the directions of the rays. The ratio of radii describes how much space the rays have to turn.
-    inner_radius = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)  # of the farthest inner point
-    radius_ratio = circle_radius / inner_radius
+    # Choose the directions of the rays. A ray is assigned to each inner point, and is rotated so that the rays are more
+    # evenly spaced. The more room there is between the inner points and the circle, the more the rays are rotated.
+    largest_inner_distance = np.abs(inner_points - circle_centre).max(axis=-1, keepdims=True)
+    radius_ratio = circle_radius / largest_inner_distance
     ray_angle = _ray_angles(blocks, inner_points - ray_origin, radius_ratio)
 
     # Compute the intersections of the rays with the circle, relative to the centre of the circle. The length t of a ray
-    # is the positive solution of |origin + t ray|^2 = circle_radius^2.
-    origin = ray_origin - circle_centre
+    # is the positive solution of |offset + t ray|^2 = circle_radius^2.
+    offset = ray_origin - circle_centre
     ray = np.exp(1j * ray_angle)  # unit vectors, shape (..., n_sector + 1)
-    projection = origin * ray.real
-    length = np.sqrt(projection**2 + circle_radius**2 - origin**2) - projection
-    intersection = origin + ray * length
+    projection = offset * ray.real
+    length = np.sqrt(projection**2 + circle_radius**2 - offset**2) - projection
+    intersection = offset + ray * length
 
     # Convert the angles on the film into angles in the template plane.
     film_angle = np.unwrap(np.angle(intersection))  # without jumps at pi
@@ -180,10 +184,10 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
 
     Outside the circle, each ray continues as the side of a sector. One ray is assigned to each given point on an inner
     boundary. This ray has the direction of the point, and is then rotated a little so that the rays become more evenly
-    spaced. Between the rays of two neighbouring points, further rays divide the angle into equal parts.
+    spaced. Between the rays of two neighbouring points, further rays divide the angle into `n_half_edge` equal parts.
 
     Args:
-        blocks: The elements.
+        blocks: Elements of the mesh. Its attribute `copies` is 2 if only half of a full turn is meshed, otherwise 1.
         inner_points: Points x + iy on the inner boundary, relative to the centroid, shape (..., n_point). Middles of
             edges and corners of the inner boundary alternate.
         radius_ratio: Ratio of the radius of the innermost circle to the largest distance of the inner points from the
@@ -196,16 +200,16 @@ def _ray_angles(blocks: Blocks, inner_points: Complexes, radius_ratio: Array) ->
     # even direction is chosen such that the even directions have the same mean as the directions of the points. The
     # last point is omitted from the means, because it repeats the first point after the meshed part of a full turn.
     point_angle = np.unwrap(np.angle(inner_points))
-    angle_from_first = np.linspace(0.0, math.tau / blocks.copies, point_angle.shape[-1])
-    first_even_angle = np.mean((point_angle - angle_from_first)[..., :-1], axis=-1, keepdims=True)
-    even_angle = first_even_angle + angle_from_first
+    even_steps = np.linspace(0.0, math.tau / blocks.copies, point_angle.shape[-1])  # from the first even direction
+    first_even_angle = np.mean((point_angle - even_steps)[..., :-1], axis=-1, keepdims=True)
+    evenly_spaced_angle = first_even_angle + even_steps
 
     # Rotate each direction towards the even direction, by half of their difference if the gap between the points and
     # the circle is at least `CLEARANCE`. A ray cannot turn within a narrow gap, so the rotation is proportional to the
     # gap. The function `tanh` limits the rotation smoothly to the largest rotation.
     max_rotation = _max_ray_rotation(inner_points)
     relative_gap = np.minimum((radius_ratio - 1.0) / CLEARANCE, 1.0)  # from 0 to 1
-    unlimited_rotation = 0.5 * relative_gap * (even_angle - point_angle)
+    unlimited_rotation = 0.5 * relative_gap * (evenly_spaced_angle - point_angle)
     rotation = max_rotation * np.tanh(unlimited_rotation / max_rotation)
 
     # Add the rays between the rays of the inner points.
@@ -301,7 +305,8 @@ def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: 
 
     The mesh is created in a unit disk, the template plane. The depth of a point is ln(r / r0) / ln(1 / r0), where r is
     the distance of the point from the origin, and r0 is the radius of the innermost circle. All rings except the thin
-    rings at the rim cover equal ranges of depth. Each thin ring is a third as wide as the previous thin ring.
+    rings at the rim cover equal ranges of depth. Each thin ring is a third as wide as the previous thin ring. Only the
+    last thin ring is half as wide as the previous thin ring, because it is extended to the rim.
 
     Args:
         resolution: Fineness of the mesh.
@@ -318,17 +323,18 @@ def ring_edges(resolution: Resolution, template_radius: Array, thin_ring_width: 
     # With the total width t, the thin rings extend from r = 1 - t to r = 1, over which ln(r) increases by about t.
     # According to the definition of the depth, the depth increases by t / ln(1 / r0).
     requested_thin_depth = -thin_ring_width / np.log(template_radius)
-    # All thin rings together are at most as deep as each of the other rings. If x is the requested depth and m is the
-    # limit, the depth is x / sqrt(1 + (x / m)^2), which is about x if x is small, and approaches m if x is large. The
-    # limit is smooth, because fields at the nodes are interpolated between presses at different distances.
+    # The total depth of all thin rings is at most as large as the depth of each of the other rings. If x is the
+    # requested depth and m is the limit, the depth is x / sqrt(1 + (x / m)^2), which is about x if x is small, and
+    # approaches m if x is large. The limit is smooth, because fields at the nodes are interpolated between presses at
+    # different distances.
     max_thin_depth = 1.0 / (resolution.rings + 1)
     limited_thin_depth = requested_thin_depth / (1.0 + (requested_thin_depth / max_thin_depth) ** 2) ** 0.5
-    thin_depth = limited_thin_depth[..., None]
+    total_thin_depth = limited_thin_depth[..., None]
 
     # The even rings share the depth up to the thin rings. The outer edge of the thin ring number i = 1, 2, ... is
-    # thin_depth / 3^i away from the rim, so that each ring is a third as wide as the previous ring.
-    edges_of_even_rings = even_edges * (1.0 - thin_depth)
-    distances_from_rim = thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
+    # total_thin_depth / 3^i away from the rim, so that each ring is a third as wide as the previous ring.
+    edges_of_even_rings = even_edges * (1.0 - total_thin_depth)
+    distances_from_rim = total_thin_depth * 3.0 ** -np.arange(1.0, resolution.rim + 1)
     edges_of_thin_rings = 1.0 - distances_from_rim
     edges_of_thin_rings[..., -1] = 1.0  # the last ring extends to the rim
     return np.concatenate([edges_of_even_rings, edges_of_thin_rings], axis=-1)

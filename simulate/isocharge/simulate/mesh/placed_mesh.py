@@ -100,18 +100,21 @@ class PlacedMesh:
     def load(self) -> Array:
         """Share of the force of the probe that acts on each node, shape (n_node,).
 
-        The shares add up to one divided by the number of copies of the mesh that cover the film.
+        The shares add up to one if the whole film is meshed, and to one half if only half of the film is meshed.
         """
         template = self.template
         placement = self.placement
         rule = self._element_rule
+        # A pressure that is not uniform needs more integration points.
         if not placement.probe.has_uniform_pressure:
             rule = _gauss_rule(self.resolution.order, PRESSURE_POINTS)
 
         # Compute the pressure at the quadrature points of the elements of the footprint.
         nodal_points = self.points[template.footprint]
         quadrature_points = nodal_points @ rule.values.T
-        centroid = placement.corners[-1] + placement.footprint_displacement  # of the footprint on the film
+        # The last entry of `corners` is the centroid of the footprint on a circular film. If the clamp is oval, the
+        # footprint is displaced.
+        centroid = placement.corners[-1] + placement.footprint_displacement
         # The factor `rotation_and_scale` converts points of the footprint, in mm, into points on the film, so the
         # division converts them back.
         points_from_centroid_mm = (quadrature_points - centroid) / placement.rotation_and_scale
@@ -162,6 +165,7 @@ class PlacedMesh:
         # `oval`, and t is the angle from its longer axis. The area is the integral of half of the squared distance over
         # all angles, which is pi (1 + e^2 / 2), because the mean of cos(2 t)^2 is one half.
         film_area = np.pi * (1.0 + 0.5 * abs(self.placement.oval) ** 2)
+        # `copies` is 2 if only half of the film is meshed, and 1 otherwise.
         mesh_area = self.template.copies * self.weights.sum()
         return math.sqrt(abs(mesh_area / film_area - 1.0))
 
@@ -190,7 +194,7 @@ class PlacedMesh:
         Returns:
             Derivatives, shape (n_element, n_local, 2, k).
         """
-        gradient = self._node_gradient
+        gradient = self._node_gradient  # of the basis functions, shape (n_element, n_local, 2, n_local)
         n_element, n_local, _, _ = gradient.shape
         stacked_gradient = gradient.reshape(n_element, n_local * 2, n_local)
         derivatives = stacked_gradient @ values  # shape (n_element, n_local * 2, k)
@@ -226,7 +230,8 @@ def place(
     needs_whole_mesh = whole or not film.is_axisymmetric
     template = template_for(resolution, probe.topology, needs_whole_mesh)
 
-    # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis.
+    # Rotate the press, the probe and the axis of an oval film such that the press lies on the positive x axis. The
+    # complex number `oval` describes the rotated clamp, and is zero for a circular clamp.
     x, y = at
     direction = math.atan2(y, x)
     distance = np.hypot(x, y)

@@ -210,7 +210,9 @@ class Placement:
     def to_circular_film(self, points: Complexes) -> Complexes:
         """Convert points of the real film, whose clamp may be oval, into points of a circular film.
 
-        The displacement depends on the unknown point of the circular film, so a fixed-point iteration finds the point.
+        The displacement from the circular film to the real film depends on the unknown point of the circular film, and
+        on the depth of this point. The depth increases from 0 at the innermost circle of the mesh, which encloses the
+        footprint, to 1 at the rim. A fixed-point iteration finds the point.
 
         Args:
             points: Points x + iy of the real film, shape (..., n), in film radii.
@@ -218,7 +220,8 @@ class Placement:
         Returns:
             Points of the circular film, shape (..., n), in film radii.
         """
-        # If the clamp is circular, there is no displacement. Otherwise, the points are a first approximation.
+        # In a first approximation, all points have the displacement of the footprint. If the clamp is circular, this
+        # displacement is zero, and so are all others.
         circular_points = points - self.footprint_displacement[..., None]
         if not self.oval.any():
             return circular_points
@@ -254,19 +257,23 @@ class Placement:
         Returns:
             Points x + iy of the circular film, shape (n_inner, (order + 1)^2), in film radii.
         """
+        # Coordinates of the nodes within an element from 0 to 1, which are the same for all elements, shape (n_local,)
         radial, angular = _unit_coordinates(blocks)
 
-        # `sides` expects one placement for each element. Add an axis of length one to this placement, and select its
-        # only entry, which has the index 0, once for each element.
-        placement_of_element = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
-        inner, outer = placement_of_element.sides(blocks, np.arange(blocks.n_inner), angular[None])
-        points: Complexes = interpolate(inner, outer, radial)
+        # `sides` expects one placement for each element, so this placement is repeated: add an axis of length one, and
+        # select its only entry, which has the index 0, once for each element.
+        repeated_placement = self[None][np.zeros(blocks.n_inner, dtype=np.intp)]
+        # Points on both sides of each element at the angular coordinates of its nodes, shape (n_inner, n_local)
+        inner_side, outer_side = repeated_placement.sides(blocks, np.arange(blocks.n_inner), angular[None])
+        points: Complexes = interpolate(inner_side, outer_side, radial)
         return points
 
     def sides(self, blocks: Blocks, element: Integers, angular: Array) -> tuple[Complexes, Complexes]:
         """Compute points on the inner and outer sides of elements that lie inside the innermost circle.
 
-        The object contains n placements, one for each element.
+        The object contains n placements, one for each element. Between the core polygon and the innermost circle, there
+        are one or two layers of elements. The points lie on a film with a circular clamp. If the real clamp is oval,
+        they are displaced later.
 
         Args:
             blocks: The elements.
@@ -277,7 +284,8 @@ class Placement:
             Points x + iy of the inner sides and of the outer sides, each of shape (n, k), in film radii.
         """
         # Compute the sides as if they were straight. The points of curved sides are replaced below. Each of the four
-        # corners of an element (index i) is a weighted sum of the corners and the centroid of the core polygon (j).
+        # corners of an element (index i) is a weighted sum of the corners and the centroid of the core polygon (j). The
+        # attribute `corners` contains these corners, followed by the centroid, shape (n, n_corner + 1).
         element_corners = np.einsum("nij,nj->in", blocks.inner_corner_weights[element], self.corners)
         inner_first, inner_last, outer_first, outer_last = element_corners[:, :, None]  # each of shape (n, 1)
         inner = interpolate(inner_first, inner_last, angular)
@@ -285,24 +293,27 @@ class Placement:
 
         # The elements are numbered from the inside to the outside: first the `n_quad` elements of the core polygon,
         # whose sides are straight, and then `n_sector` elements of each layer. The sector of an element is its position
-        # within its layer. An element of the core polygon also gets a number, but the number is not used.
+        # within its layer. An element of the core polygon also gets a sector, but the sector has no effect.
         in_last_layer = element >= blocks.n_inner - blocks.n_sector
         sector = (element[:, None] - blocks.n_quad) % blocks.n_sector
 
-        # The outer sides of the last layer lie on the innermost circle.
+        # The outer sides of the last layer lie on the innermost circle. In the template plane, this circle has the
+        # centre 0 and the radius `template_radius`. The conformal map `to_film` converts its points into film points.
         first_angle = np.take_along_axis(self.circle_angles, sector, axis=1)
         last_angle = np.take_along_axis(self.circle_angles, sector + 1, axis=1)
         angle = interpolate(first_angle, last_angle, angular)  # in the template plane
         circle_points = self.to_film(self.template_radius[:, None] * np.exp(1j * angle))
         outer[in_last_layer] = circle_points[in_last_layer]
 
-        # If there are two layers, the boundary of the footprint separates them.
+        # If there are two layers, the boundary of the footprint separates them. `boundary` computes its points from a
+        # parameter, which increases from 0 to 2 pi around the footprint. With one layer, the inner sides are straight.
         if blocks.n_layer == 2:
             in_first_layer = (element >= blocks.n_quad) & ~in_last_layer
             first_parameter = blocks.boundary_parameter[sector]
             last_parameter = blocks.boundary_parameter[sector + 1]
             assert isinstance(self.probe, CurvedProbe)
             boundary = self.probe.boundary(interpolate(first_parameter, last_parameter, angular))
+            # The last entry of `corners` is the centroid.
             boundary_points = _on_film(boundary, self.corners[..., -1], self.rotation_and_scale)
             outer[in_first_layer] = boundary_points[in_first_layer]
             inner[in_last_layer] = boundary_points[in_last_layer]
@@ -311,26 +322,30 @@ class Placement:
     def _ring_element_points(self, blocks: Blocks) -> Complexes:
         """Compute the film points of the nodes in the rings, which lie between the innermost circle and the rim.
 
+        The points are first computed in a unit disk, the template plane. A conformal map converts them into points of a
+        circular film. If the real clamp is oval, the points are then displaced.
+
         Args:
-            blocks: The elements.
+            blocks: Elements of the mesh. The rings are divided into sectors.
 
         Returns:
             Film points x + iy, shape (n_ring * n_sector, (order + 1)^2), in film radii.
         """
         # Depths of the nodes, from 0 on the innermost circle to 1 on the rim
-        radial, angular = _unit_coordinates(blocks)
+        radial, angular = _unit_coordinates(blocks)  # of the nodes within an element, from 0 to 1, shape (n_local,)
         inner_depth = self.ring_depths[:-1, None, None]
         outer_depth = self.ring_depths[1:, None, None]
         depth = interpolate(inner_depth, outer_depth, radial)  # shape (n_ring, 1, n_local)
 
         # The angle of a node and the logarithm of its radius are interpolated linearly with respect to the depth,
         # between the innermost circle and the rim. On the rim, the logarithm of the radius is 0.
+        # First, interpolate between the two sides of each sector, shape (n_sector, n_local).
         circle_angle = interpolate(self.circle_angles[:-1, None], self.circle_angles[1:, None], angular)
         rim_angle = interpolate(self.rim_angles[:-1, None], self.rim_angles[1:, None], angular)
         angle = interpolate(circle_angle, rim_angle, depth)  # shape (n_ring, n_sector, n_local)
         log_radius = (1.0 - depth) * np.log(self.template_radius)
         template_points = np.exp(log_radius + 1j * angle)
-        circular_points = self.to_film(template_points)
+        circular_points = self.to_film(template_points)  # on the circular film
         film_points = circular_points + self.displacement(circular_points, depth)
         return film_points.reshape(-1, radial.size)  # one row for each element
 

@@ -64,7 +64,7 @@ class Template(Blocks):
     """
 
     def __init__(self, resolution: Resolution, topology: FootprintTopology, whole: bool = False) -> None:
-        """Count the elements and number their nodes.
+        """Count the elements, which the constructor of the base class does, and number their nodes.
 
         Nodes of different elements count as one node if they have the same position under a sample press.
 
@@ -75,7 +75,8 @@ class Template(Blocks):
         """
         super().__init__(resolution, topology, whole)
         # No element is folded under the sample press. Therefore two nodes have the same position only if they are the
-        # same node.
+        # same node. The film has the radius 1, and SAMPLE_LAYER is the total width of the thin rings at its rim. The
+        # placement reads only the elements of this object, which have been counted, and not the nodes.
         probe = SampleProbe(SAMPLE_REACH, topology)
         placement = Placement.of(self, probe, np.array(SAMPLE_DISTANCE), 1.0, SAMPLE_LAYER)
         element_points = placement.element_points(self)  # x + iy in film radii, shape (n_element, n_local)
@@ -84,6 +85,7 @@ class Template(Blocks):
         _, self.first_occurrence, node_number = np.unique(rounded_points, return_index=True, return_inverse=True)
         self.nodes: Integers = node_number.reshape(element_points.shape)
         self.n_node = self.first_occurrence.size
+        # The local coordinates xi and eta of a node are -1 or 1 on the sides of its element.
         self.is_interior = np.maximum(np.abs(self.xi), np.abs(self.eta)) < 1.0
 
         # Find the nodes on the rim, and the nodes on the line of symmetry of a half mesh.
@@ -119,7 +121,7 @@ def locate_points(placement: Placement, blocks: Blocks, points: Complexes) -> tu
     if np.any(is_inside):
         # The corners of the elements are the same for all points of a row, and are computed once for each row.
         row_of_point, _ = np.nonzero(is_inside)  # for each point inside the circle
-        rows, index_in_rows = np.unique(row_of_point, return_inverse=True)
+        rows, index_in_rows = np.unique(row_of_point, return_inverse=True)  # rows[index_in_rows] is row_of_point
         corners_of_rows = _inner_corners(placement[rows], blocks)
         element[is_inside], coordinates[:, is_inside] = _locate_inside(
             placement[row_of_point], blocks, circular_points[is_inside], corners_of_rows[index_in_rows]
@@ -158,8 +160,8 @@ def _locate_in_rings(placement: Placement, blocks: Blocks, template_points: Comp
     rim_angles = placement.rim_angles.T[..., None]
     side_angles = interpolate(circle_angles, rim_angles, depth)  # shape (n_sector + 1, k, n)
 
-    # Find the sectors. If the whole film is meshed, add full turns such that each angle lies within one turn after the
-    # first side.
+    # Find the sectors. If the whole film is meshed, and not only its upper half, add full turns such that each angle
+    # lies within one turn after the first side.
     angle = np.angle(template_points)
     if not blocks.half:
         angle = side_angles[0] + np.mod(angle - side_angles[0], math.tau)
@@ -207,34 +209,38 @@ def _locate_inside(
     Returns:
         Index of the element, shape (n,). Radial and angular coordinate in the element from 0 to 1, shape (2, n).
     """
-    # Each side runs from its start to its end with the element on its left.
+    # The first corners of an element lie clockwise of its last corners. The start and the end of each side are ordered
+    # such that the element lies on the left of the side. The four sides are the side through both first corners, the
+    # side through both last corners, the inner side and the outer side.
     inner_first, inner_last, outer_first, outer_last = np.moveaxis(corners, -1, 0)
     sides = ((inner_first, outer_first), (outer_last, inner_last), (inner_last, inner_first), (outer_first, outer_last))
     distances = [_distance_to_left(start, end, points[:, None]) for start, end in sides]
     smallest_distance = np.min(distances, axis=0)  # shape (n, n_inner)
     candidates = np.argsort(-smallest_distance, axis=1)
 
-    element = candidates[:, 0]
-    coordinates = np.full((2, points.size), np.inf)
+    # Try the elements. For each point, keep the element in which the coordinates exceed the range from 0 to 1 least.
+    # `_overshoot` returns by how much they exceed the range. At first, no coordinates are known, so they are infinite.
+    best_element = candidates[:, 0]
+    best_coordinates = np.full((2, points.size), np.inf)
     for candidate in candidates.T:
-        # Select the points whose element has not been found yet, apart from rounding errors of the coordinates.
-        remaining = np.flatnonzero(_overshoot(coordinates) > 1e-9)
+        # A point is found if its coordinates lie in the range. The tolerance 1e-9 is for rounding errors.
+        remaining = np.flatnonzero(_overshoot(best_coordinates) > 1e-9)
         if remaining.size == 0:
             break
         tried_element = candidate[remaining]
         new_coordinates = _local_coordinates(placement[remaining], blocks, points[remaining], tried_element)
-        is_better = _overshoot(new_coordinates) < _overshoot(coordinates[:, remaining])
+        is_better = _overshoot(new_coordinates) < _overshoot(best_coordinates[:, remaining])
         improved = remaining[is_better]
-        element[improved] = tried_element[is_better]
-        coordinates[:, improved] = new_coordinates[:, is_better]
-    return element, coordinates
+        best_element[improved] = tried_element[is_better]
+        best_coordinates[:, improved] = new_coordinates[:, is_better]
+    return best_element, best_coordinates
 
 
 def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
     """Return the corners of all elements inside the innermost circle.
 
     Args:
-        placement: n placements.
+        placement: Positions of the mesh under n presses.
         blocks: The elements.
 
     Returns:
@@ -242,12 +248,13 @@ def _inner_corners(placement: Placement, blocks: Blocks) -> Complexes:
         corner of the inner side, and the first and the last corner of the outer side.
     """
     # The corners are the ends of the inner and the outer side, at the angular coordinates 0 and 1. The sides of all
-    # elements are computed for each placement.
+    # elements are computed for each placement. The angular coordinate increases anticlockwise.
     n_placement = len(placement.template_radius)
     placement_index = np.repeat(np.arange(n_placement), blocks.n_inner)
     element = np.tile(np.arange(blocks.n_inner), n_placement)
-    sides = placement[placement_index].sides(blocks, element, np.array([[0.0, 1.0]]))
-    return np.concatenate(sides, axis=1).reshape(n_placement, blocks.n_inner, 4)
+    # Ends of the inner and of the outer side, each of shape (n * n_inner, 2)
+    inner_and_outer_ends = placement[placement_index].sides(blocks, element, np.array([[0.0, 1.0]]))
+    return np.concatenate(inner_and_outer_ends, axis=1).reshape(n_placement, blocks.n_inner, 4)
 
 
 def _local_coordinates(placement: Placement, blocks: Blocks, points: Complexes, element: Integers) -> Array:
