@@ -82,9 +82,9 @@ class Assembly:
 
         # Compute the global indices of the unknowns of each element. Globally, the unknowns are numbered node by node:
         # the index of an unknown is unknowns_per_node * node + component.
-        unknown = (unknowns_per_node * template.nodes[:, None] + component).reshape(len(template.nodes), -1)
-        self.interior_unknowns = unknown[:, self._interior_indices]
-        self.side_unknowns = unknown[:, self._side_indices]
+        unknown_indices = (unknowns_per_node * template.nodes[:, None] + component).reshape(len(template.nodes), -1)
+        self.interior_unknowns = unknown_indices[:, self._interior_indices]
+        self.side_unknowns = unknown_indices[:, self._side_indices]
 
         # The skeleton unknowns are the free unknowns on sides.
         is_in_skeleton = np.zeros(self.free.size, dtype=bool)
@@ -93,7 +93,7 @@ class Assembly:
         self._compute_sparsity_pattern()
 
         # Sort the skeleton unknowns in the order of elimination, which is determined from the pattern of the unsorted
-        # unknowns. Then compute the pattern of the sorted unknowns.
+        # unknowns. Then compute the pattern again for the sorted unknowns, because it depends on their order.
         self.skeleton = self.skeleton[self._elimination_order()]
         self._compute_sparsity_pattern()
 
@@ -181,7 +181,7 @@ class Assembly:
         schur_complement = side_block - coupling.transpose(0, 2, 1) @ reduced_coupling
 
         # Add the Schur complements of all elements. All entries of fixed unknowns are added to an unused number after
-        # the nonzero entries.
+        # the nonzero entries, which is then omitted.
         entry_count = self._indices.size + 1
         skeleton_entries = np.bincount(self._entry_positions, schur_complement.ravel(), entry_count)[:-1]
         skeleton_factor = factorise(self._skeleton_matrix(skeleton_entries), "NATURAL")
@@ -209,11 +209,12 @@ class Assembly:
         Returns:
             Solution (U1, U2, W) at the nodes, shape (n_node, 3). Fixed unknowns are zero.
         """
-        padded_right = np.zeros(self.free.shape)
+        padded_right = np.zeros(self.free.shape)  # (n_node, unknowns_per_node)
         padded_right[:, :3] = right  # the right-hand side of the auxiliary unknown of bending is zero
         flat_right = padded_right.ravel()
 
-        # Eliminate the interior unknowns of each element from the right-hand side.
+        # Eliminate the interior unknowns of each element from the right-hand side. `bincount` adds the contributions of
+        # all elements to each unknown on a side.
         interior_right = flat_right[self.interior_unknowns][..., None]  # shape (n_element, n_interior, 1)
         interior_solution = interior_inverse @ interior_right
         coupled_right = coupling.transpose(0, 2, 1) @ interior_solution  # shape (n_element, n_side, 1)
@@ -308,6 +309,8 @@ def factor_tangent(
     response = solve_film(uniform_pressure)  # y
     response_volume = float(weights @ response[:, 2])  # v . y
     air_stiffness = back_pressure.stiffness(field[:, 2])  # c
+    # A volume that the film would displace without the air raises the pressure by the following factor. The film gives
+    # way to the higher pressure, so the factor is smaller than the stiffness of the air.
     pressure_per_volume = air_stiffness / (1.0 + air_stiffness * response_volume)
 
     def solve_with_air(right: Array) -> Array:

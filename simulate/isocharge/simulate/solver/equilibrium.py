@@ -119,6 +119,7 @@ def deflection(equilibrium: Equilibrium, points: Array) -> Array:
     basis_values = tensor_values(mesh.resolution.order, xi, eta)  # shape (n, n_local)
     nodal_field = equilibrium.field[mesh.template.nodes[element]]  # (U1, U2, W), shape (n, n_local, 3)
     scaled_deflection = (basis_values * nodal_field[..., 2]).sum(axis=1)
+    # The unit of the deflection W is the film radius times the amplitude.
     deflection_unit = equilibrium.film.radius * np.sqrt(equilibrium.groups.squared_amplitude)
     return np.asarray(deflection_unit * scaled_deflection)
 
@@ -138,18 +139,20 @@ def touch_stress(equilibrium: Equilibrium, points: Array, surface: Surface = "mi
     Raises:
         SceneError: If a point lies outside the film.
     """
-    mesh = equilibrium.mesh
-    groups = equilibrium.groups
+    # Compute the scaled stress in the frame of the press. The function in the third argument computes the derivatives
+    # of fields at the points from their values at the nodes of every element.
     element, xi, eta, is_reflected = _locate(equilibrium, points)
+    gradient = equilibrium.mesh.gradient(element, xi, eta)  # of the basis functions, shape (n, 2, n_local)
+    scaled_stress = _induced_stress(equilibrium, surface, lambda values: gradient @ values[element])
 
-    # Compute the stress in the frame of the press. The shear stress has the opposite sign in the reflected half.
-    gradient = mesh.gradient(element, xi, eta)  # derivatives of the basis functions, shape (n, 2, n_local)
-    induced_stress = _induced_stress(equilibrium, surface, lambda values: gradient @ values[element])
-    press_frame_stress = equilibrium.film.young * groups.squared_amplitude * induced_stress
+    # Convert the stress to MPa. The shear stress has the opposite sign in the reflected half.
+    stress_unit = equilibrium.film.young * equilibrium.groups.squared_amplitude
+    press_frame_stress = stress_unit * scaled_stress
     press_frame_stress[is_reflected, 2] *= -1.0
 
-    # Rotate the stress into the axes of the film, and subtract the stress of the film before the contact, which is zero
-    # without a static pressure.
+    # Rotate the stress into the axes of the film, and subtract the stress of the film before the contact. `rest` is the
+    # equilibrium before the contact under a static pressure alone, and has no `rest` of its own. Without a static
+    # pressure, there is no stress before the contact.
     film_stress = rotate_stress(press_frame_stress, equilibrium.direction)
     if equilibrium.rest is None:
         return film_stress
@@ -188,14 +191,18 @@ def _induced_stress(equilibrium: Equilibrium, surface: Surface, derivatives_of: 
             respect to (X1, X2), shape (..., 2, k).
 
     Returns:
-        Stress (S11, S22, S12) in units of E_young A^2, shape (..., 3).
+        Stress (S11, S22, S12) in units of E_young A^2, shape (..., 3). The amplitude A of the press is the approximate
+        deflection of the film in film radii.
     """
-    nodal_displacement = equilibrium.field[equilibrium.mesh.template.nodes]  # (U1, U2, W)
-    total_strain = strain(derivatives_of(nodal_displacement), equilibrium.groups.squared_amplitude)
+    # The attribute `groups` contains the dimensionless numbers of the press, `field` the displacements (U1, U2, W).
+    nodal_displacement = equilibrium.field[equilibrium.mesh.template.nodes]
+    surface_strain = strain(derivatives_of(nodal_displacement), equilibrium.groups.squared_amplitude)
     if surface != "middle":
-        second_derivatives = derivatives_of(_continuous_slope(equilibrium))  # of the deflection W
-        total_strain += _bending_strain(equilibrium, surface, second_derivatives)
-    return total_strain @ equilibrium.groups.elasticity
+        # The second derivatives of W are the derivatives of its slope. The slope of the solved W jumps between the
+        # elements, so it is first replaced by a slope that is continuous.
+        second_derivatives = derivatives_of(_continuous_slope(equilibrium))
+        surface_strain += _bending_strain(equilibrium, surface, second_derivatives)
+    return surface_strain @ equilibrium.groups.elasticity
 
 
 def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
@@ -212,7 +219,7 @@ def principal_stress(equilibrium: Equilibrium) -> tuple[float, float]:
     """
     # Compute the principal stresses, scaled and without the mean pretension. The stress tensor includes the uneven part
     # of the pretension, because this part changes the directions of the principal stresses.
-    uneven_tension = equilibrium.groups.uneven_tension
+    uneven_tension = equilibrium.groups.uneven_tension  # in the unit of the scaled stresses
     without_rest = replace(equilibrium, rest=None)  # so that the stress before the contact is not subtracted
     surfaces: list[Surface] = ["middle", "top", "bottom"] if equilibrium.theory.bending else ["middle"]
     stresses = [principal_stresses(nodal_stress(without_rest, surface) + uneven_tension) for surface in surfaces]
@@ -250,7 +257,8 @@ def _continuous_slope(equilibrium: Equilibrium) -> Array:
     element_count = np.bincount(template.nodes.ravel())  # number of elements that share each node
     slope = slope_sum / element_count[:, None]
     slope[template.on_rim] = 0.0
-    slope[template.on_axis, 1] = 0.0  # the deflection is symmetric about the axis of a half mesh
+    # The deflection of a half mesh is symmetric about the x axis, so its slope across this axis is zero there.
+    slope[template.on_axis, 1] = 0.0
     return slope[template.nodes]
 
 
@@ -265,7 +273,7 @@ def _bending_strain(equilibrium: Equilibrium, surface: Surface, second_derivativ
         second_derivatives: Second derivatives of W with respect to (X1, X2), shape (..., 2, 2).
 
     Returns:
-        Strain (E11, E22, 2 E12), shape (..., 3), in units of A^2.
+        Strain (E11, E22, 2 E12), shape (..., 3), in units of A^2, where A is the amplitude of the press.
     """
     film = equilibrium.film
     amplitude = np.sqrt(equilibrium.groups.squared_amplitude)
@@ -275,6 +283,7 @@ def _bending_strain(equilibrium: Equilibrium, surface: Surface, second_derivativ
     curvature_22 = second_derivatives[..., 1, 1]
     double_curvature_12 = second_derivatives[..., 0, 1] + second_derivatives[..., 1, 0]
     curvature = np.stack([curvature_11, curvature_22, double_curvature_12], axis=-1)
+    # The relative height is 0 in the middle, 1 at the top and -1 at the bottom.
     return np.asarray((SURFACE_HEIGHT[surface] * half_thickness) * curvature)
 
 
@@ -360,7 +369,7 @@ def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
     # Integration points of all patches, six along each side. The coordinates xi and eta range from -1 to 1.
     film_radius = equilibrium.film.radius
     xi, eta, weights = gauss_reference_square(6)
-    half_side = film_radius / 30.0
+    half_side = film_radius / 30.0  # half of a fifteenth
     complex_points = (centres[:, :, None] + half_side * (xi + 1j * eta)).ravel()
     points = to_corners(complex_points)
 
@@ -369,7 +378,8 @@ def _patch_charges(equilibrium: Equilibrium, centres: Complexes) -> Array:
     stress = np.zeros((len(points), 3))
     stress[is_on_film] = touch_stress(equilibrium, points[is_on_film])
 
-    # Compute the mean stress of each patch. The sum of the weights of the integration points is 4.
+    # Compute the mean stress of each patch. The sum of the weights of the integration points is 4. The matrix product
+    # sums over the points.
     patch_stress = stress.reshape(*centres.shape, -1, 3)  # shape (n_ring, n_patch, n_point, 3)
     mean_stress = 0.25 * (weights @ patch_stress)
 

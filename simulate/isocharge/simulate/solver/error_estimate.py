@@ -74,7 +74,8 @@ def change_of_charges(equilibrium: Equilibrium, settings: SolveSettings, read_ch
 def mesh_error(equilibrium: Equilibrium, read_charges: ReadCharges) -> float:
     """Estimate the error that the mesh causes in a charge, relative to the largest charge.
 
-    If the press was solved on two meshes, the estimate is the relative difference between the results on both meshes.
+    If the press was solved on two meshes, the estimate is the relative difference between the results on both meshes,
+    which is the attribute `proven_error`.
     If the press was solved on one mesh, it is solved again on a mesh of the next higher order.
 
     Args:
@@ -121,6 +122,7 @@ def modelling_error(equilibrium: Equilibrium, read_charges: ReadCharges) -> floa
     effect_of_bending = change_of_charges(equilibrium, other_theory, read_charges)
     if has_bending:
         return float(np.std(stiffness) / np.mean(stiffness)) * min(effect_of_bending, 1.0)
+    # If bending changes the charges by 100 % or more, a theory without bending does not describe the film.
     return effect_of_bending if effect_of_bending < 1.0 else np.inf
 
 
@@ -150,12 +152,13 @@ def cautions(equilibrium: Equilibrium) -> tuple[str, ...]:
     Returns:
         One sentence for each warning.
     """
-    smallest, largest = principal_stress(equilibrium)
+    smallest, largest = principal_stress(equilibrium)  # MPa, negative in compression
     sentences = []
     if largest > DEFAULT_STRESS_LIMIT:
         sentences.append(f"the film is stressed to {largest:.3g} MPa; PVDF yields from {DEFAULT_STRESS_LIMIT:g} MPa on")
     if smallest < -WRINKLE_SHARE * largest:
         sentences.append(f"the film is compressed to {smallest:.3g} MPa somewhere; a thin film may wrinkle there")
+    # The pretension in the direction of its smallest value. `deviator` is its uneven part: (T11 - T22) / 2 and T12.
     smallest_tension = equilibrium.film.pretension - np.hypot(*equilibrium.film.deviator)
     if smallest_tension < 0.0:
         sentences.append(

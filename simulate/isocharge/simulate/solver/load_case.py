@@ -135,12 +135,13 @@ def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
     Raises:
         SceneError: If the footprint is not completely on the film, or if it is too close to the rim.
     """
-    # The function `farthest_distance` refers to the circular film that is deformed into an oval film. The outline is
+    # The mesh of an oval film is made on a circular film, which is then deformed. The function `farthest_distance`
+    # measures the distance of the farthest point of the footprint from the centre of the circular film. The outline is
     # also compared with the oval rim itself. A NaN in the position makes both comparisons false.
-    farthest = farthest_distance(film, probe, at)
+    farthest_on_circular_film = farthest_distance(film, probe, at)
     outline = complex(*at) + probe.outline
-    relative_distance = film.relative_distance(outline)
-    is_on_film = farthest < film.radius * (1.0 - 1e-6) and relative_distance.max() < 1.0
+    relative_distance = film.relative_distance(outline)  # 1 on the rim
+    is_on_film = farthest_on_circular_film < film.radius * (1.0 - 1e-6) and relative_distance.max() < 1.0
     if not is_on_film:
         worst_angle = np.angle(outline[relative_distance.argmax()])
         raise SceneError(
@@ -149,7 +150,9 @@ def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
             f"{film.rim_distance(worst_angle):.4g} mm from it there"
         )
 
-    rim_distance = film.radius - farthest
+    # A curved footprint that is not circular has a layer of elements between itself and a circle around it. Close to
+    # the rim, this layer would be too thin.
+    rim_distance = film.radius - farthest_on_circular_film
     min_rim_distance = MIN_RIM_DISTANCE * probe.reach
     is_curved_but_not_round = probe.topology.is_curved and not probe.topology.fills_circle
     if is_curved_but_not_round and rim_distance < min_rim_distance:
@@ -163,26 +166,27 @@ def _check_position(film: Film, probe: Probe, at: tuple[float, float]) -> None:
 def farthest_distance(film: Film, probe: Probe, at: tuple[float, float]) -> float:
     """Compute the distance from the centre of the film to the farthest point of the footprint, mm.
 
-    The mesh of an oval film is the deformed mesh of a circular film. For a press on an oval film, the function
-    therefore first computes the place of the press on the circular film before the deformation. The distance is
-    measured from this place. On both kinds of film, the footprint lies on the film if the returned distance is less
-    than the radius of the film.
+    On every film, the footprint lies on the film if the returned distance is less than the radius of the film. The mesh
+    of an oval film is the deformed mesh of a circular film. For a press on an oval film, the function therefore first
+    computes the place of the press on the circular film before the deformation. The distance is measured at this place.
 
     Args:
         film: The film.
         probe: The probe.
         at: Centroid (x, y) of the footprint, mm.
     """
+    # Compute both distances of the press from the centre in film radii. The complex number `oval` describes the shape
+    # of the clamp relative to the direction of the press, and is zero for a circular clamp.
     x, y = at
     direction = math.atan2(y, x)
     oval = film_oval(film, direction)
     with np.errstate(all="ignore"):  # the caller refuses a huge distance or NaN
-        distance = np.hypot(x, y) / film.radius
-        distance_on_circular_film = circular_distance(distance, oval, probe.reach / film.radius)
+        relative_distance = np.hypot(x, y) / film.radius
+        relative_circular_distance = circular_distance(relative_distance, oval, probe.reach / film.radius)
 
-    # Rotate the press onto the positive x axis.
+    # Rotate the press onto the positive x axis. The method of the probe computes the distance of its farthest point.
     rotated_probe = probe.rotated(-direction)
-    return rotated_probe.farthest_distance((film.radius * float(distance_on_circular_film), 0.0))
+    return rotated_probe.farthest_distance((film.radius * float(relative_circular_distance), 0.0))
 
 
 def layer_for(film: Film, force: float, settings: SolveSettings) -> float:
@@ -283,6 +287,7 @@ def needs_second_mesh(case: LoadCase) -> bool:
         case: The press and the required accuracy.
     """
     radius = case.film.radius
+    # A footprint fills the innermost circle of the mesh if it is circular.
     is_large = not case.probe.topology.fills_circle and case.probe.reach > RELIABLE_REACH * radius
     is_near_rim = farthest_distance(case.film, case.probe, case.at) > RELIABLE_RADIUS * radius
     must_be_accurate = case.settings.accuracy < ACCURACY
@@ -312,6 +317,7 @@ def _candidate_resolutions(case: LoadCase) -> Iterator[Resolution]:
     Args:
         case: The press and the required accuracy.
     """
+    # `around` is the number of elements around the innermost circle.
     first_resolution = _first_resolution(case)
     for order_increase, around_factor in REFINEMENTS:
         order = first_resolution.order + order_increase
@@ -323,17 +329,18 @@ def _first_resolution(case: LoadCase) -> Resolution:
     """Choose the coarsest resolution that is tried for a press.
 
     The mesh is created in a unit disk, which a conformal map maps onto the film. A circle in the disk encloses the
-    footprint, and rings of elements lie between this circle and the rim. A small probe needs more rings. A press close
-    to the rim needs more rings and more elements around the circle, because the conformal map stretches the mesh.
-    Trapped air or a static pressure also bends the film in narrow strips between the probe and the rim. The narrow
-    strips need more rings.
+    footprint, and rings of elements lie between this circle and the rim. The rings are divided into sectors, whose
+    number is `around`. A small probe needs more rings. A press close to the rim needs more rings, and sometimes more
+    sectors, because the conformal map stretches the mesh. Trapped air or a static pressure also bends the film in
+    narrow strips between the probe and the rim. The narrow strips need more rings.
 
     Args:
         case: The press and the required accuracy.
     """
     has_bending = case.settings.theory.bending
 
-    # Place a coarse mesh to obtain the conformal map, which is the same for all meshes under the press.
+    # Place a coarse mesh to obtain the conformal map, which is the same for all meshes under the press. It does not
+    # depend on the width of the thin rings at the rim (`layer`).
     coarse_resolution = Resolution(order=2, around=8, rings=1)
     placement = place(case.film, case.probe, case.at, coarse_resolution, layer=0.1).placement
 
@@ -341,8 +348,8 @@ def _first_resolution(case: LoadCase) -> Resolution:
     first_order = 5 if has_bending else 4
     extra_order = max(0, math.ceil(1.4 * math.log10(ACCURACY / case.settings.accuracy)))
 
-    # A small radius of the innermost circle and the stretch of the conformal map require more rings (empirical
-    # factors).
+    # A small radius of the innermost circle and the stretch of the conformal map at the rim, where the radius is 1,
+    # require more rings, and so does a higher accuracy. The factors and the limits are empirical.
     rings_for_radius = -1.3 * math.log(float(placement.template_radius))
     rings_for_stretch = min(2.0 * math.log(map_stretch(placement.map_parameter, 1.0)), 4.0)
     rings = max(3, math.ceil(rings_for_radius + rings_for_stretch)) + extra_order // 2
@@ -371,17 +378,20 @@ def _needs_more_sectors(case: LoadCase) -> bool:
     """
     film = case.film
     probe = case.probe
-    normal_gap = CLEARANCE * probe.reach
+    normal_gap = CLEARANCE * probe.reach  # the reach is the distance from the centroid to the farthest point
     extent_with_gap = farthest_distance(film, probe, case.at) + normal_gap  # distance from the centre of the film
+    # A circular footprint fills the innermost circle, so it has no gap.
     is_crowded = not probe.topology.fills_circle and extent_with_gap > film.radius
 
+    # The strain that the force causes is of the order of the squared amplitude. The attribute `deviator` is the uneven
+    # part of the pretension: half of the difference T11 - T22, and the shear T12, in MPa.
     load_stress = film.young * amplitude_squared(film, case.force)
     uneven_stress = np.hypot(*film.deviator)
     is_uneven = bool(uneven_stress > MAX_UNEVENNESS * load_stress)
     return is_crowded or is_uneven
 
 
-def _thin_ring_count(placement: Placement, total_width: float) -> int:
+def _thin_ring_count(placement: Placement, strip_width: float) -> int:
     """Compute the number of thin rings at the rim of the mesh.
 
     At the clamped rim, the film bends within a narrow strip, which the thin rings resolve. The mesh is created in a
@@ -393,18 +403,18 @@ def _thin_ring_count(placement: Placement, total_width: float) -> int:
 
     Args:
         placement: Placement of the mesh under the press.
-        total_width: Width of the strip on the film, in film radii.
+        strip_width: Width of the strip on the film, in film radii.
     """
     # Compute the largest and the smallest width of the strip in the template plane. Next to the probe, the conformal
     # map multiplies lengths by 1 / stretch, and on the opposite side by `stretch`. On the opposite side, a strip that
     # is wider than 0.2 film radii is resolved like a strip of 0.2 film radii.
-    stretch = float(map_stretch(placement.map_parameter, 1.0))
-    width_next_to_probe = total_width * stretch
-    opposite_width = min(total_width, 0.2) / stretch
+    stretch = float(map_stretch(placement.map_parameter, 1.0))  # at the rim, where the distance from the origin is 1
+    width_next_to_probe = strip_width * stretch
+    opposite_width = min(strip_width, 0.2) / stretch
 
     # Divide the widths by the range of ln(r) that all rings cover, where r is the distance from the origin. At the rim,
     # r is 1, so a small width is equal to the difference of ln(r) across it. The upper limit keeps the thin rings near
-    # the rim.
+    # the rim. Below the limit, the range has no effect on the ratio of both shares, which determines the number.
     log_range = -math.log(placement.template_radius)
     max_share = 1.0 / 8.0
     largest_share = min(width_next_to_probe / log_range, max_share)

@@ -77,6 +77,7 @@ def first_iterate(elastic: ElasticFilm) -> Array:
     """
     mesh = elastic.mesh
     groups = elastic.groups
+    # Convert the nodes of a film with an oval clamp into points of a circular film, and these into the template plane.
     circular_points = mesh.placement.to_circular_film(mesh.node_points)
     template_distance = np.abs(mesh.placement.to_template(circular_points))
     # The cube root of r^2 has a sharp tip at r = 0. The squared radius of the innermost circle is added to r^2, which
@@ -84,6 +85,7 @@ def first_iterate(elastic: ElasticFilm) -> Array:
     squared_radius = float(mesh.placement.template_radius) ** 2
     probe_shape = np.cbrt(1.0 + squared_radius) - np.cbrt(template_distance**2 + squared_radius)
     pressure_shape = 1.0 - np.abs(circular_points) ** 2
+    # `height` and `static_height` are the approximate deflections of the centre under the probe and under the pressure.
     field = np.zeros((circular_points.size, 3))
     field[:, 2] = groups.height * probe_shape + groups.static_height * pressure_shape
     field[mesh.template.on_rim] = 0.0  # removes rounding errors
@@ -108,20 +110,22 @@ def solve_newton(
     Returns:
         The result, which may not have converged.
     """
+    # Whether each displacement is free, shape (n_node, 3), without the auxiliary unknown of bending, which is the
+    # fourth column. False means that the fields are even about the line of symmetry of a half mesh.
     free = assembly(elastic.mesh.template, elastic.unknowns_per_node, False).free[:, :3]
     iterate = _Iterate(elastic, free, first_field)
     iteration = 0
     while True:
-        relative_residual = iterate.relative_residual
-        if not np.isfinite(relative_residual):
+        residual_before_step = iterate.relative_residual
+        if not np.isfinite(residual_before_step):
             return iterate.result(iteration, "failed", "the residual is not a finite number")
-        if relative_residual <= tolerance:
+        if residual_before_step <= tolerance:
             return iterate.result(iteration, "converged", f"converged in {iteration} steps")
         if iteration == MAX_ITERATIONS:
             return iterate.result(iteration, "failed", f"not converged after {iteration} steps")
 
         # Take a step with a new tangent, and further steps with the same tangent.
-        stabilising_tension = _stabilising_tension(elastic, relative_residual)
+        stabilising_tension = _stabilising_tension(elastic, residual_before_step)
         solve = factor_tangent(elastic, iterate.field, stabilising_tension)
         step = solve(-iterate.residual)
         if iterate.size_of(step) <= ROUND_OFF:
@@ -129,7 +133,7 @@ def solve_newton(
         next_iterate = _take_step(iterate, step, full_steps_below)
         if next_iterate is None:
             return iterate.result(iteration, "failed", "no step lowers the energy any more")
-        iterate = _chord_steps(next_iterate, solve, relative_residual, tolerance)
+        iterate = _chord_steps(next_iterate, solve, residual_before_step, tolerance)
         iteration += 1
 
 
@@ -261,7 +265,7 @@ def _chord_steps(iterate: _Iterate, solve: SolveTangent, previous_residual: floa
     while iterate.relative_residual > tolerance:
         step = solve(-iterate.residual)
         next_iterate = iterate.after(step)
-        lowers_energy = np.sum(step * iterate.residual) < 0.0
+        lowers_energy = np.sum(step * iterate.residual) < 0.0  # the residual is the gradient of the energy
         halves_residual = next_iterate.relative_residual < 0.5 * iterate.relative_residual
         if not (lowers_energy and halves_residual):  # also if a number is NaN
             break
@@ -285,14 +289,15 @@ def _descent_step(iterate: _Iterate, newton_step: Array) -> Array:
     """
     elastic = iterate.elastic
     step = newton_step
-    # The first tension is a twentieth of the stabilising tension at a relative residual of one.
+    # The first tension is a twentieth of the largest stabilising tension, which is `STABILISING_TENSION` times the
+    # tension that the load induces.
     added_tension = 0.05 * STABILISING_TENSION * elastic.groups.induced_tension
     for _ in range(12):
         energy_slope = float(np.sum(step * iterate.residual))
         is_descent_direction = np.isfinite(step).all() and energy_slope < 0.0
         if is_descent_direction:
             break
-        solve_stiffer = factor_tangent(elastic, iterate.field, added_tension)
+        solve_stiffer = factor_tangent(elastic, iterate.field, added_tension)  # solves systems with this tangent
         step = solve_stiffer(-iterate.residual)
         added_tension *= 2.0
     return step
@@ -315,7 +320,7 @@ def _line_search(iterate: _Iterate, step: Array) -> _Iterate | None:
     elastic = iterate.elastic
     energy = elastic.energy(iterate.field)
     energy_slope = float(np.sum(step * iterate.residual))  # derivative of the energy with respect to the step length
-    residual_norm = np.linalg.norm(iterate.residual[iterate.free])
+    residual_norm = np.linalg.norm(iterate.residual[iterate.free])  # without the reactions at fixed displacements
     step_length = 1.0
     for _ in range(30):
         next_iterate = iterate.after(step_length * step)

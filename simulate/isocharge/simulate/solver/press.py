@@ -76,6 +76,7 @@ def press(
         SceneError: If the press cannot exist, or if the mesh is too distorted.
         SolveError: If the solve fails.
     """
+    # `case.place` and `choose_mesh` return a mesh: with a given resolution, or with the coarsest sufficient resolution.
     case = LoadCase(film, probe.under(force), at, force, settings, side_force)
     with single_threaded_blas():
         if settings.resolution != "auto":
@@ -107,7 +108,7 @@ def needed_resolution(
         SceneError: If the press cannot exist, or if every mesh for the press is too distorted.
         SolveError: If two meshes must be compared and no equilibrium is found.
     """
-    case = LoadCase(film, probe.under(force), at, force, settings)
+    case = LoadCase(film, probe.under(force), at, force, settings)  # `under` returns the probe with its footprint
     if settings.resolution != "auto":
         return settings.resolution
     if needs_second_mesh(case):
@@ -172,7 +173,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
     Raises:
         SceneError: If an element of the mesh is folded.
     """
-    if np.isinf(mesh.shape_error):  # an element is folded
+    if np.isinf(mesh.shape_error):  # the predicted error is infinite if an element is folded
         raise too_near_the_rim(case, mesh.resolution)
     elastic = _elastic_film(case, mesh, case.force)
 
@@ -199,6 +200,7 @@ def _solve(case: LoadCase, mesh: PlacedMesh, start: Equilibrium | None) -> Equil
         seconds=process_time() - case.began,
         **vars(result),
     )
+    # With a static pressure, add the equilibrium before the contact.
     if has_static_pressure:
         return _with_rest(equilibrium, case.settings.tolerance)
     return equilibrium
@@ -218,7 +220,9 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
         Equilibrium of the press with the attribute `rest`. Its status is "failed" if no equilibrium before the contact
         is found.
     """
-    groups = replace(equilibrium.groups, load=0.0, side_load=(0.0, 0.0))  # the units remain those of the press
+    # `groups` contains the dimensionless numbers of the press. Without the force of the probe, they still refer to the
+    # units of the press, so that the stresses can be subtracted.
+    groups = replace(equilibrium.groups, load=0.0, side_load=(0.0, 0.0))
     elastic = ElasticFilm(equilibrium.mesh, groups)
     result = solve_newton(elastic, first_iterate(elastic), tolerance)
 
@@ -233,14 +237,14 @@ def _with_rest(equilibrium: Equilibrium, tolerance: float) -> Equilibrium:
 
 
 def _elastic_film(case: LoadCase, mesh: PlacedMesh, force: float) -> ElasticFilm:
-    """Create the discrete model of the film for a given press, but with a different force.
+    """Create the discrete model of the film for a given press and a given force.
 
-    The side force is changed in proportion to the force.
+    The force may differ from the force of the press. The side force is changed in proportion to the force.
 
     Args:
         case: The press.
         mesh: Mesh of the press.
-        force: The different force, N.
+        force: Force of the model, N.
     """
     x, y = case.at
     force_factor = force / case.force
@@ -282,11 +286,13 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
     field = first_iterate(full_load)
     force = case.force / 16.0
     for tries_left in reversed(range(12)):
-        # The field under a smaller force is close to the solution, so full Newton steps are allowed from the start.
+        # Full Newton steps are allowed if the relative residual is below a limit. The field under a smaller force is
+        # close to the solution, so full steps are then allowed from the start.
         full_steps_below = np.inf if solved_force > 0.0 else UNSTABILISED_BELOW
         elastic = _elastic_film(case, full_load.mesh, force)
         result = solve_newton(elastic, field, case.settings.tolerance, full_steps_below)
         iterations += result.iterations
+        # The comparison of the forces is exact, because the last force is set to the full force by `min` below.
         if result.status == "converged" and force == case.force:
             message = f"converged in {iterations} steps, the load in parts"
             return replace(result, iterations=iterations, message=message)
@@ -297,6 +303,7 @@ def _solve_by_load_steps(case: LoadCase, failed: NewtonResult, full_load: Elasti
             field = result.field
         else:
             force_factor = np.sqrt(force_factor)
+        # Stop if the full force is out of reach. This is always so if the first force failed: `solved_force` is zero.
         if solved_force * force_factor**tries_left < case.force:
             break
         force = min(case.force, solved_force * force_factor)
@@ -317,7 +324,8 @@ def _first_field(start: Equilibrium | None, elastic: ElasticFilm) -> Array:
     if start is None:
         return first_iterate(elastic)
 
-    # Both meshes have the same elements if the topology, the symmetry and the resolution except for the order agree.
+    # Both meshes have the same elements if the topology, the symmetry (whether only half of the film is meshed), and
+    # the resolution except for the order agree. The order is therefore made equal for the comparison.
     template = elastic.mesh.template
     start_template = start.mesh.template
     start_resolution = replace(start_template.resolution, order=template.resolution.order)
@@ -349,7 +357,8 @@ def _failure_reason(solved: Equilibrium, tolerance: float) -> str:
         f"residual {solved.residual:.2g} (expected {tolerance:.2g}) after {solved.iterations} steps"
     )
     if smallest_stress < 0.0:
-        # A larger force stretches a film that is slack in a direction, so that fewer wrinkles remain.
+        # A larger force stretches a film that is slack in a direction, so that fewer wrinkles remain. The deviator is
+        # the uneven part of the pretension. Its magnitude is the mean pretension minus the smallest pretension.
         is_slack = solved.film.pretension < np.hypot(*solved.film.deviator)
         message += (
             f"; the film is compressed to {smallest_stress:.3g} MPa on the way: it wrinkles, which has many solutions; "

@@ -187,11 +187,9 @@ FILM_IS_ODD = np.array([field.odd for field in FILM_FIELDS])
 def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
     """Compute how the scaled stress at the nodes changes if a property of the film or the radius of the probe changes.
 
-    `FILM_FIELDS` lists the properties. The film is rotated such that the press lies on the positive x axis. The stress
-    is compared at fixed points of the rotated film. An even change of the film is symmetric about the x axis, and an
-    odd change is antisymmetric. A change of the tension is measured in units of E A^2 + T, where E is Young's modulus,
-    A is the amplitude of the press, and T is the mean pretension. The tension under the press has the same order of
-    magnitude.
+    Each entry of `FILM_FIELDS` describes one property. The film is rotated such that the press lies on the positive x
+    axis. The stress is compared at fixed points of the rotated film. An even change of the film is symmetric about the
+    x axis, and an odd change is antisymmetric.
 
     Args:
         solved: Press with a circular probe.
@@ -199,10 +197,11 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
 
     Returns:
         Change of the stress per unit of each property, shape (n_element, n_local, n_field, 3). The last axis is the
-        stress component (S11, S22, S12).
+        stress component (S11, S22, S12). The unit of a tension is E A^2 + T, where E is Young's modulus, A is the
+        amplitude of the press, and T is the mean pretension. The tension under the press has this order of magnitude.
     """
     # The touch stress is the stress under the press minus the stress before the contact. Its changes are the same
-    # difference of the changes of both stresses.
+    # difference of the changes of both stresses. `rest` is the equilibrium before the contact under a static pressure.
     if solved.rest is not None:
         before_contact = stress_changes(solved.rest, surface)
         under_press = stress_changes(replace(solved, rest=None), surface)
@@ -222,12 +221,13 @@ def stress_changes(solved: Equilibrium, surface: Surface) -> Array:
             groups = elastic.back_pressure.at_constant_pressure(solved.field[:, 2])
             solved_for_odd = replace(solved, groups=groups)
 
+        # `add` is the function that adds a value to the property.
         changes = []
-        for field in FILM_FIELDS:
-            if field.odd:
-                changes.append(_change_of_stress(solved_for_odd, field.add, solve_odd, surface))
+        for film_property in FILM_FIELDS:
+            if film_property.odd:
+                changes.append(_change_of_stress(solved_for_odd, film_property.add, solve_odd, surface))
             else:
-                changes.append(_change_of_stress(solved, field.add, solve_even, surface))
+                changes.append(_change_of_stress(solved, film_property.add, solve_even, surface))
         return np.stack(changes, axis=2)
 
 
@@ -261,7 +261,8 @@ def _change_of_stress(solved: Equilibrium, add_change: AddChange, solve: SolveTa
     change = (positive_stress - negative_stress) / (2.0 * STEP)
 
     # The nodes move with an oval rim or with the edge of the probe. Subtract the change of the stress that the movement
-    # of the nodes causes, so that the result holds for fixed points of the film.
+    # of the nodes causes, so that the result holds for fixed points of the film. The two presses only have different
+    # meshes if the changed property moves the nodes.
     if positive_press.mesh is not negative_press.mesh:
         node_shift = (positive_press.mesh.points - negative_press.mesh.points) / (2.0 * STEP)
         change -= change_by_node_shift(solved.mesh, nodal_stress(solved, surface), node_shift)
@@ -312,7 +313,7 @@ def holding_force(solved: Equilibrium) -> tuple[float, float]:
         solve = factor_tangent(solved.elastic, solved.field)
         for direction in range(n_direction):
             unit_load = np.zeros_like(solved.field)
-            unit_load[:, direction] = mesh.load
+            unit_load[:, direction] = mesh.load  # distributes a load of 1 over the nodes with the same weights
             compliance[:, direction] = mesh.load @ solve(unit_load)[:, :n_direction]
 
     # Compute the scaled side load that cancels the slip.
@@ -347,5 +348,5 @@ def friction_force(solved: Equilibrium, coefficient: float) -> tuple[float, floa
     check_range("coefficient of friction", coefficient, (0.0, MAX_SIDE_SHARE), "", SceneError)
     holding_x, holding_y = holding_force(solved)
     magnitude = max(math.hypot(holding_x, holding_y), 1e-300)  # the limit avoids a division by zero
-    reduction = min(1.0, coefficient * solved.force / magnitude)
-    return reduction * holding_x, reduction * holding_y
+    factor = min(1.0, coefficient * solved.force / magnitude)  # 1 if the film sticks to the probe
+    return factor * holding_x, factor * holding_y

@@ -85,10 +85,10 @@ def force_within_stress(film: Film, probe: Probe, limit: float, force_range: tup
         SolveError: If no equilibrium is reached.
     """
     min_force, max_force = force_range
-    smallest_stress = largest_stress(film, probe, min_force)
-    if smallest_stress > limit:
+    stress_at_min_force = largest_stress(film, probe, min_force)
+    if stress_at_min_force > limit:
         raise SceneError(
-            f"stress limit: expected more than {smallest_stress:.3g} MPa, which {min_force:.3g} N under "
+            f"stress limit: expected more than {stress_at_min_force:.3g} MPa, which {min_force:.3g} N under "
             f"{probe.notation} make at its centre, got {limit:.3g} MPa"
         )
     if largest_stress(film, probe, max_force) <= limit:
@@ -121,7 +121,7 @@ def yield_force(film: Film, probes: Sequence[Probe], force_range: tuple[float, f
     for probe in probes:
         try:
             probe_force = force_within_stress(film, probe, DEFAULT_STRESS_LIMIT, force_range)
-        except SceneError:  # the film yields already at the smallest force
+        except SceneError:  # raised if the film yields already at the smallest force
             yield_forces.append(min_force)
         except SolveError:
             continue
