@@ -186,7 +186,7 @@ def _force_nodes(forward_map: ForwardMap) -> Array:
     return np.exp(log_force)
 
 
-def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> Array:
+def _scaled_charges(forward_map: ForwardMap, spline_force: Array, position: Array) -> Array:
     """Compute the scaled charges of presses at given positions. Splines are fitted to these charges.
 
     A scaled charge is a charge divided by the squared amplitude of the press. Each charge is the sum of two parts. The
@@ -195,24 +195,25 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
 
     Args:
         forward_map: Forward map that computes the charges.
-        force: Forces at which the splines are fitted, shape (n_force,), N.
+        spline_force: Forces at which the splines are fitted, shape (n_force,), N.
         position: Positions (x, y), shape (n, 2), mm.
 
     Returns:
         Scaled charges, shape (n, n_force, n_electrode), pC.
     """
+    # Compute the charges of the stress at the forces for which the map was solved. The last axis of the charges is for
+    # several stress fields. This map has a single field, which has the index 0.
     sensor = forward_map.sensor
     solved_force = forward_map.family.force
-    stress_charge = forward_map.charges_by_force(position)[..., 0]  # shape (n_solved_force, n, n_electrode)
-    solved_charge = stress_charge.swapaxes(0, 1)  # shape (n, n_solved_force, n_electrode)
-    solved_charge /= amplitude_squared(sensor.film, solved_force)[:, None]
+    stress_charge = forward_map.charges_by_force(position)[..., 0].swapaxes(0, 1)  # (n, n_solved_force, n_electrode)
+    solved_scaled_charge = stress_charge / amplitude_squared(sensor.film, solved_force)[:, None]
 
     # A sensor with d33 has more spline forces than solved forces. Interpolate the charges to the spline forces.
-    force_weights = lagrange_values(np.log(solved_force), np.log(force))
-    scaled_charge = force_weights @ solved_charge  # shape (n, n_force, n_electrode)
+    force_weights = lagrange_values(np.log(solved_force), np.log(spline_force))
+    scaled_charge = force_weights @ solved_scaled_charge  # shape (n, n_force, n_electrode)
 
-    # Add the charge of the contact pressure.
-    for index, one_force in enumerate(force.tolist()):
+    # Add the charge of the contact pressure. Then `calibration.read` adds the crosstalk between the electrodes.
+    for index, one_force in enumerate(spline_force.tolist()):
         contact = contacts_at(position, one_force)
         pressure_charge = contact_charges(sensor, forward_map.probe, contact)
         scaled_charge[:, index] += pressure_charge / amplitude_squared(sensor.film, one_force)
@@ -222,9 +223,9 @@ def _scaled_charges(forward_map: ForwardMap, force: Array, position: Array) -> A
 def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.interpolate.NdBSpline":
     """Fit a cubic spline to the scaled charges of all electrodes over the disk.
 
-    The fit is by least squares, with a penalty on the third differences of the coefficients. The spline is defined on
-    the square around the disk. The penalty determines the coefficients in the corners of the square, where there are no
-    positions.
+    A scaled charge is a charge divided by the squared amplitude of the press. The fit is by least squares, with a
+    penalty on the third differences of the coefficients. The spline is defined on the square around the disk. The
+    penalty determines the coefficients in the corners of the square, where there are no positions.
 
     Args:
         forward_map: Forward map that computes the charges.
@@ -243,7 +244,7 @@ def _fit_disk(forward_map: ForwardMap, force: Array, spacing: float) -> "scipy.i
     line_knots = np.pad(cell_edges, 3, mode="edge")
     knots = (line_knots, line_knots)
     axis_count = line_knots.size - 4  # number of coefficients along an axis
-    position = radius * _fit_positions(cells)
+    position = radius * _fit_positions(cells)  # the function returns positions in the unit disk
     scaled_charge = _scaled_charges(forward_map, force, position)  # shape (n, n_force, n_electrode)
 
     # The design matrix converts the coefficients into the values of the spline. The matrix of SciPy has no columns for

@@ -93,12 +93,13 @@ class FilmSlopes:
         """
         if not probe.is_axisymmetric:
             raise SceneError(f"properties of a film: expected a circular probe, got {probe.notation}")
-        count = few_nodes(sensor.film, domain)
+        # The map applies the function `read` to each solved press. Its results are the entries of the table of the map.
+        count = few_nodes(sensor.film, domain)  # numbers of distances and forces of the solved presses
         solved_map = ForwardMap.build_unchecked(
             sensor, probe, domain, count, settings, read=_stress_and_changes, executor=executor
         )
-        # At each node, the first field is the stress, and the other fields are its changes. Divide the table into the
-        # tables of two maps.
+        # At each node of the mesh, the first field is the stress, and the other fields are its changes. Divide the
+        # table into the tables of two maps.
         n_press = len(solved_map.table)
         n_field = 1 + len(FILM_FIELDS)
         fields = solved_map.table.reshape(n_press, -1, n_field, 3)  # shape (n_press, n_node, n_field, 3)
@@ -113,10 +114,12 @@ class FilmSlopes:
         """Compute the derivatives of the charges with respect to the properties of the film.
 
         `sensitivity.FILM_FIELDS` lists the properties. The unit of a tension is MPa, the unit of the radius of the
-        probe is mm, and the other properties are dimensionless.
+        probe is mm, and the other properties are dimensionless. The attribute `film` of the object is the forward map
+        of the film. The attribute `fields` is a forward map whose stress fields are the changes of the stress per unit
+        of each property.
 
         Args:
-            contact: Presses (x, y, F) in the domain of `film`, shape (n, 3), mm and N.
+            contact: Presses (x, y, F) in the domain of the forward map `film`, shape (n, 3), mm and N.
 
         Returns:
             Dictionary from the name of each property to the derivatives of the charges, shape (n, n_electrode), pC per
@@ -125,25 +128,28 @@ class FilmSlopes:
         Raises:
             SceneError: If a press lies outside the domain.
         """
+        # Compute the charges that the changes of the stress cause. `FILM_IS_ODD` states which of the fields are odd
+        # under a reflection in the line from the centre to the press.
         contact = self.film.domain.check(contact, "properties of a film")
         film = self.film.sensor.film
         charge_without_crosstalk = self.fields.field_charges(contact, FILM_IS_ODD).swapaxes(1, 2)
         field_charge = self.film.sensor.calibration.read(charge_without_crosstalk)  # shape (n, n_field, n_electrode)
 
-        # The fields of a tension are the changes by a tension of this unit (MPa). Convert them into changes per MPa.
-        tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension
+        # The fields of a tension are the changes per tension unit, which is E A^2 + T with Young's modulus E, the
+        # amplitude A of the press and the pretension T. Convert them into changes per MPa.
+        tension_unit = film.young * amplitude_squared(film, contact[:, 2]) + film.pretension  # MPa, shape (n,)
         field_charge[:, TENSION_FIELDS] /= tension_unit[:, None, None]
 
-        # After the fields without a direction, there are pairs of an even and an odd field. The even field is the
-        # change that is caused by an imperfection whose axis points to the press, at the angle t from the x axis. For
-        # the odd field, the axis is rotated by 45 degrees. An imperfection is the complex number size * exp(2 i axis),
-        # because half a turn does not change it. The factor exp(2 i t) therefore rotates the pair into the axes x and
-        # y.
+        # The first `SCALAR_FIELDS` fields have no direction. They are followed by a pair of an even and an odd field
+        # for each imperfection with an axis. The axis of the even field points to the press, in the direction t. The
+        # axis of the odd field has the direction t + 45 degrees. An imperfection is the complex number
+        # size * exp(2 i axis), because half a turn does not change it. The factor exp(2 i t) therefore converts the
+        # pair into the derivatives with respect to the real part and the imaginary part of this number.
         directed_charge = field_charge[:, SCALAR_FIELDS:]  # a view, so that changes also change `field_charge`
-        even = directed_charge[:, ::2]
-        odd = directed_charge[:, 1::2]
+        even_charge = directed_charge[:, ::2]
+        odd_charge = directed_charge[:, 1::2]
         direction = np.arctan2(contact[:, 1], contact[:, 0])[:, None, None]  # t
-        components = (even + 1j * odd) * np.exp(2j * direction)
+        components = (even_charge + 1j * odd_charge) * np.exp(2j * direction)
         directed_charge[:, ::2] = components.real
         directed_charge[:, 1::2] = components.imag
         return {field.name: field_charge[:, index] for index, field in enumerate(FILM_FIELDS)}

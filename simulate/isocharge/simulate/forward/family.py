@@ -158,18 +158,20 @@ class Family:
         n_force = count.forces if max_log_force > min_log_force else 1
         force = np.exp(chebyshev_nodes(n_force, min_log_force, max_log_force))
 
-        # Find the period, which is the smallest rotation of the probe relative to the press after which the stress
-        # repeats. If the orientation of the probe on the film may change, this is the period of the probe. If the probe
-        # keeps its orientation on the film, the film rotates together with the probe. Half a turn does not change the
-        # film. Half a turn also does not change the probe if a full turn contains an even number of periods of the
-        # probe.
+        # Find the period, which is the smallest rotation of the probe relative to the direction of the press after
+        # which the stress repeats. If the orientation of the probe on the film may change, or does not affect the
+        # stress, this is the period of the probe.
         period = probe.period
+        # Whether the probe keeps its orientation on the film, and this orientation affects the stress
         is_oriented = orientation == "fixed" and not film.is_axisymmetric and not probe.is_axisymmetric
         if is_oriented:
+            # The film and the probe rotate together. Half a turn maps the film onto itself. Half a turn also maps the
+            # probe onto itself if its symmetry order, the number of its periods in a full turn, is even.
             symmetry_order = round(math.tau / period)
             period = math.pi if symmetry_order % 2 == 0 else math.tau
 
-        # Choose the directions of the presses and the rotations of the probe.
+        # Choose the turns. A turn is a pair of a direction of the press on the film and a rotation of the probe. The
+        # direction has no effect of its own if the film is axisymmetric or rotates together with the probe.
         has_directions = not film.is_axisymmetric and not is_oriented
         turns = Turns.spread(count.largest_harmonics, period, has_directions=has_directions)
         return cls(domain, film.radius, distance, force, turns, is_oriented)
@@ -191,7 +193,8 @@ class Family:
             Weights, shape (n, n_distance * n_force * n_turn), dimensionless. An interpolated value is the sum of the
             values at all nodes, each multiplied by the weight of its node.
         """
-        # Compute the interpolation weights along each axis. The direction of a turn includes the rotation of the probe.
+        # Compute the interpolation weights along each axis. The first angle of a turn is the sum of the direction of
+        # the press and the rotation of the probe, and the second angle is the rotation.
         node_coordinates = distance_coordinate(self.distance / self.film_radius)
         press_coordinates = distance_coordinate(np.abs(position) / self.film_radius)
         distance_weights = lagrange_values(node_coordinates, press_coordinates)
@@ -228,7 +231,7 @@ class Family:
             `unfold` extends stresses to all rotations.
         """
         # A place is a distance and a turn. The presses at one place are solved in one job.
-        turns = self.turns.solved
+        turns = self.turns.solved  # pairs of angles within one period of the probe
         places = [(distance, turn) for distance in self.distance.tolist() for turn in turns]
         solve_place = partial(self._solve_forces, sensor, probe, settings, read)
         values_of_places = track(in_order(executor, solve_place, places), "solving the film", len(places))
@@ -250,33 +253,35 @@ class Family:
         Args:
             sensor: Sensor with the film, and with the surface at which the stress is read.
             probe: Probe that presses the film.
-            settings: Theory, mesh and width of the thin rings at the rim.
+            settings: Theory and mesh, which are the same for all presses.
             read: Function that computes the returned values from each solved press.
-            place: Distance from the centre of the film, mm, and the two angles of a turn, rad. The second angle is the
-                rotation of the probe. The first angle is the direction of the press plus this rotation.
+            place: Distance from the centre of the film, mm, and a turn. A turn is a pair of angles, rad. Its first
+                angle is the sum of the direction of the press and the rotation of the probe. Its second angle is the
+                rotation of the probe.
 
         Returns:
             Values that `read` computes, shape (n_force, n_value).
         """
+        distance, (angle_sum, rotation) = place
+        direction = angle_sum - rotation
         # Rotate the film by the opposite of the direction of the press, so that the press lies on the positive x axis.
-        distance, (direction_plus_rotation, rotation) = place
-        direction = direction_plus_rotation - rotation
         film = sensor.film.rotated(-direction)
         rotated_probe = probe.rotated(rotation)
-        values_of_forces = []
+        values_by_force = []
         equilibrium = None
         for force in self.force.tolist():
             # The equilibrium under the previous force is a good start for the iterations of the solver.
             equilibrium = press(film, rotated_probe, (distance, 0.0), force, settings, start=equilibrium)
-            values_of_forces.append(read(equilibrium, sensor.surface).ravel())
-        return np.stack(values_of_forces)
+            values_by_force.append(read(equilibrium, sensor.surface).ravel())
+        return np.stack(values_by_force)
 
     def unfold(self, solved: Array, mesh: Template) -> Array:
         """Copy the stress from the rotations within one period of the probe to all rotations.
 
-        A period is the smallest rotation that maps the probe onto itself. A rotation of the probe by one period does
-        not change the press, but rotates the mesh. The stress of each further period is therefore obtained from the
-        stress of the solved period: the elements of the mesh are renumbered, and the stress components are rotated.
+        A turn is a pair of a direction of the press and a rotation of the probe. A period is the smallest rotation that
+        maps the probe onto itself, and contains n_solved_turn turns. A rotation of the probe by one period does not
+        change the press, but rotates the mesh. The stress of each further period is therefore obtained from the stress
+        of the solved period: the elements of the mesh are renumbered, and the stress components are rotated.
 
         Args:
             solved: Scaled stress in a frame that rotates with the probe, as returned by `solve`, shape
@@ -284,13 +289,13 @@ class Family:
             mesh: Template of the mesh of the solves.
 
         Returns:
-            Scaled stress, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless. The rows are
-            in the same order as the columns of the array that `weights` returns.
+            Scaled stress, shape (n_distance * n_force * n_turn, n_element * n_local * 3), dimensionless. There is one
+            row for each press. The presses are ordered by distance, force and turn, as in `weights`.
         """
-        symmetry_order = self.turns.symmetry_order
-        n_value = solved.shape[-1]
-        if symmetry_order == 1:  # the copies below would need four times the memory of a large table
-            return solved.reshape(-1, n_value)
+        symmetry_order = self.turns.symmetry_order  # number of periods in a full turn
+        values_per_press = solved.shape[-1]
+        if symmetry_order == 1:  # nothing to copy; the code below would need four times the memory of a large table
+            return solved.reshape(-1, values_per_press)
 
         # Shape (n_distance, n_force, n_solved_turn, n_element, n_local, 3)
         solved_stress = solved.reshape(*solved.shape[:-1], mesh.n_element, -1, 3)
@@ -302,8 +307,8 @@ class Family:
             # The stress itself does not change, but its components refer to a frame that was rotated by `angle`.
             stress_of_periods.append(rotate_stress(renumbered_stress, -angle))
 
-        all_turns = np.concatenate(stress_of_periods, axis=2)
-        return all_turns.reshape(-1, n_value)
+        stress_of_turns = np.concatenate(stress_of_periods, axis=2)  # the axis of the turns
+        return stress_of_turns.reshape(-1, values_per_press)
 
 
 def node_counts(film: Film) -> tuple[NodeCount, ...]:
@@ -361,8 +366,9 @@ def check_domain(domain: Domain) -> None:
 def check_family(film: Film, probe: Probe, domain: Domain) -> None:
     """Raise an error if no forward map can be built for a film, a probe and a domain.
 
-    Only the outermost press with the largest force is checked. If the outermost press with the largest force can exist,
-    all other presses of the domain can exist, too. On an oval film, the outermost press lies on the shorter semi-axis.
+    A forward map is built from solved presses of the domain, which are called a family. Only the outermost press with
+    the largest force is checked. If the outermost press with the largest force can exist, all other presses of the
+    domain can exist, too. On an oval film, the outermost press lies on the shorter semi-axis.
 
     Args:
         film: Film of the forward map.
@@ -406,17 +412,18 @@ def family_mesh(film: Film, probe: Probe, domain: Domain, settings: SolveSetting
         settings: Required accuracy, theory, and parts of the mesh. A part that is "auto" is chosen here.
 
     Returns:
-        Fineness of the mesh, and total width of the thin rings at the rim, in film radii.
+        Fineness of the mesh (order of the elements and numbers of elements and rings), and total width of the thin
+        rings at the rim, in film radii. The setting `layer` of the solver is this width.
     """
     min_force, max_force = domain.force_range
     middle_force = math.sqrt(min_force * max_force)
     ring_width = layer_for(film, middle_force, settings)
 
-    # The press that is nearest to the clamp needs the finest mesh. If the pretension is uneven, or if the footprint
-    # grows with the force, the smallest force needs the finest mesh.
-    force = middle_force if film.is_axisymmetric and not probe.grows else min_force
-    outermost = nearest_to_clamp(film, domain.radius)
-    resolution = needed_resolution(film, probe, outermost, force, replace(settings, layer=ring_width))
+    # The press that is nearest to the clamp needs the finest mesh. If the film is not axisymmetric, for example because
+    # its pretension is uneven, or if the footprint grows with the force, the smallest force needs the finest mesh.
+    force = min_force if probe.grows or not film.is_axisymmetric else middle_force
+    outermost_position = nearest_to_clamp(film, domain.radius)
+    resolution = needed_resolution(film, probe, outermost_position, force, replace(settings, layer=ring_width))
     return resolution, ring_width
 
 

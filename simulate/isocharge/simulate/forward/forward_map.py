@@ -139,7 +139,7 @@ class ForwardMap:
         # Solve a few check presses directly. The interpolated charges of every map are compared with these charges, so
         # all maps have the mesh of the first map.
         contact, rotation = spread_check_presses(domain, CHECK_COUNT)
-        if forward_map.family.is_oriented:
+        if forward_map.family.is_oriented:  # the probe cannot be rotated
             rotation = np.zeros(CHECK_COUNT)
         checks = np.column_stack([contact, rotation]).tolist()
         solve_directly = partial(direct_charges, sensor, probe, forward_map.settings)
@@ -194,13 +194,13 @@ class ForwardMap:
             SolveError: If a press has no equilibrium.
         """
         check_family(sensor.film, probe, domain)
-        resolution, layer = family_mesh(sensor.film, probe, domain, settings)
-        same_mesh = SolveSettings(theory=settings.theory, resolution=resolution, layer=layer)
+        resolution, ring_width = family_mesh(sensor.film, probe, domain, settings)  # of the thin rings at the rim
+        fixed_settings = SolveSettings(theory=settings.theory, resolution=resolution, layer=ring_width)
         family = Family.spread(domain, sensor.film, probe, count, orientation)
-        solved_values = family.solve(sensor, probe, same_mesh, executor, read)
+        solved_values = family.solve(sensor, probe, fixed_settings, executor, read)
         template = template_for(resolution, probe.topology, not sensor.film.is_axisymmetric)
-        table = family.unfold(solved_values, template)
-        return cls(sensor, probe, family, settings.theory, resolution, layer, table, error=np.inf)
+        table = family.unfold(solved_values, template)  # the stress fields at all rotations of the probe
+        return cls(sensor, probe, family, settings.theory, resolution, ring_width, table, error=np.inf)
 
     @property
     def domain(self) -> Domain:
@@ -246,7 +246,7 @@ class ForwardMap:
         if not np.isfinite(orientation).all():
             wrong_orientation = orientation[~np.isfinite(orientation)][0]
             raise SceneError(f"forward map: expected finite orientations in rad, got {wrong_orientation}")
-        if self.family.is_oriented and orientation.any():
+        if self.family.is_oriented and orientation.any():  # the map is only valid without a rotation
             raise SceneError(
                 f"forward map: expected {self.probe.notation} in its own orientation, got a rotation by "
                 f"{orientation[orientation != 0.0][0]:.4g} rad; build the map with orientation='random'"
@@ -315,37 +315,38 @@ class ForwardMap:
         n_force = self.family.force.size
         if not self.probe.grows:
             return self._same_mesh_charges(position, is_odd, slice(n_force), np.float32)
-        single_forces = [slice(index, index + 1) for index in range(n_force)]
-        return np.concatenate([self._same_mesh_charges(position, is_odd, force, np.float64) for force in single_forces])
+        slices = [slice(index, index + 1) for index in range(n_force)]  # each selects a single force
+        return np.concatenate([self._same_mesh_charges(position, is_odd, selected, np.float64) for selected in slices])
 
-    def _same_mesh_charges(self, position: Array, is_odd: Booleans, forces: slice, precision: type) -> Array:
-        """Compute the charges of each stress field for some forces of the family that share the same mesh.
+    def _same_mesh_charges(self, position: Array, is_odd: Booleans, selected: slice, number_type: type) -> Array:
+        """Compute the charges of each stress field for some forces of the solved presses that share the same mesh.
 
         Args:
             position: Positions (x, y) in the domain, shape (n, 2), mm.
             is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
                 (n_field,).
-            forces: Slice that selects the forces from the family.
-            precision: Number type to which the stress fields are converted.
+            selected: Slice that selects these forces from the forces of all solved presses.
+            number_type: Number type to which the stress fields are converted.
 
         Returns:
             Charges, shape (n_selected_force, n, n_electrode, n_field), pC.
         """
         # The integration points depend on the mesh, and not on the force. To locate them only once, treat the fields of
         # different forces like different fields of one force. Create a map that has only the first selected force, but
-        # the fields of all selected forces at each node. The table of this map has one row for each distance and turn.
+        # the fields of all selected forces at each node. A turn is a direction of a press and a rotation of the probe.
         family = self.family
-        force = family.force[forces]
+        force = family.force[selected]
         n_field = is_odd.size
         press_shape = (family.distance.size, family.force.size, family.turns.rotation.size)
-        table = self.table.reshape(*press_shape, -1, n_field * 3)[:, forces]  # the fourth axis is the node
-        fields = np.moveaxis(table, 1, 3)  # shape (n_distance, n_turn, n_node, n_selected_force, n_field * 3)
+        stress_by_force = self.table.reshape(*press_shape, -1, n_field * 3)[:, selected]  # (distance, force, turn, ...)
+        fields = np.moveaxis(stress_by_force, 1, 3)  # shape (n_distance, n_turn, n_node, n_selected_force, n_field * 3)
         single_force_map = replace(
             self,
             probe=self.probe.under(force[0]),
             family=replace(family, force=force[:1]),
-            table=fields.reshape(-1, fields[0, 0].size).astype(precision),
+            table=fields.reshape(-1, fields[0, 0].size).astype(number_type),  # a row for each distance and turn
         )
+        # All forces have the same fields in the same order.
         charge = single_force_map.field_charges(contacts_at(position, force[0]), np.tile(is_odd, force.size))
         charge_by_force = charge.reshape(*charge.shape[:2], force.size, n_field)
 
@@ -376,14 +377,14 @@ class ForwardMap:
         """Compute the charges of each stress field in the table of the map.
 
         The table contains stress fields at the nodes of the mesh under the solved presses: the stress itself, or its
-        changes with several properties of the film. The result includes neither the crosstalk nor the charges that the
-        contact pressure causes. The presses are evaluated in chunks, which limits the required memory.
+        changes with several properties of the film. A row of the table contains all fields at one node, then all fields
+        at the next node. The result includes neither the crosstalk nor the charges that the contact pressure causes.
+        The presses are evaluated in chunks, which limits the required memory.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
             is_odd: Whether each field is odd under a reflection in the line from the centre to the press, shape
-                (n_field,). A row of the table contains the values of all fields at one node, then the values at the
-                next node.
+                (n_field,).
             orientation: Rotation of the probe in addition to its own orientation, shape (n,) or a number, rad.
 
         Returns:
@@ -411,7 +412,7 @@ class ForwardMap:
         """Compute the charges of each stress field for a probe whose footprint grows with the force.
 
         The mesh depends on the footprint, so the stress fields cannot be interpolated between forces. Instead, the
-        charges at the forces of the family are divided by the squared amplitude, and interpolated.
+        charges at the forces of the solved presses (the family) are divided by the squared amplitude, and interpolated.
 
         Args:
             contact: Presses (x, y, F), shape (n, 3), mm and N.
@@ -425,6 +426,7 @@ class ForwardMap:
         family_force = self.family.force
         force = contact[:, 2]
         weights = lagrange_values(np.log(family_force), np.log(force))
+        # Divide by the squared amplitude at the force of the family, and multiply by that at the force of the press.
         weights *= amplitude_squared(film, force)[:, None] / amplitude_squared(film, family_force)
         family_charges = self.charges_by_force(contact[:, :2], is_odd)
         # Sum over the forces of the family (index k), for each press (n), electrode (e) and field (f).
@@ -435,8 +437,8 @@ class ForwardMap:
     ) -> ChargeDensity:
         """Interpolate the stress fields under several presses, and convert them into charge per area.
 
-        If only half of the film is meshed, the charge per area is also computed for the reflection of the mesh. The
-        pieces of the electrodes may be of different kinds. Each kind has its own weights of the stress.
+        If only half of the film is meshed, the charge per area is also computed for the reflection of the mesh. An
+        electrode consists of pieces of one or two kinds. Each kind has its own weights of the stress components.
 
         Args:
             position: Positions x + iy, shape (n,), mm.
@@ -460,8 +462,8 @@ class ForwardMap:
         oval = film_oval(film, direction)
         placement = Placement.of(template, self.probe, np.abs(position), film.radius, self.layer, rotation, oval)
 
-        # Interpolate the stress in the precision of the table, and multiply by the unit of the scaled stress. A row of
-        # the table contains the stress of all fields at one node, then those at the next node.
+        # Interpolate between the solved presses (the family), in the precision of the table, and multiply by the unit
+        # of the scaled stress. A row of the table contains all fields at one node, then all fields at the next node.
         stress_unit = film.young * amplitude_squared(film, force)
         weights = self.family.weights(position, force, rotation) * stress_unit[:, None]
         interpolated = weights.astype(self.table.dtype) @ self.table  # one row for each press
@@ -469,16 +471,15 @@ class ForwardMap:
 
         # Convert the stress, whose components refer to a frame that rotates with the probe, into charge per area. If
         # only half of the film is meshed, there is a second sign for the reflection of the mesh.
-        frame_angle = direction + rotation + self.probe.angle
-        charge_per_frame_stress = rotate_stress(np.eye(3), frame_angle[:, None]) @ charge_per_stress.T  # (n, 3, n_kind)
-        signs = _reflection_signs(is_odd) if template.half else np.ones((n_field, 3, 1))
-        # Shape (n, n_field, 3, n_sign, n_kind)
-        coefficients = signs[..., None] * charge_per_frame_stress[:, None, :, None]
-        density = stress @ coefficients.reshape(*stress.shape[:2], 3, -1).astype(stress.dtype)
+        probe_angle = direction + rotation + self.probe.angle
+        charge_per_probe_stress = rotate_stress(np.eye(3), probe_angle[:, None]) @ charge_per_stress.T  # (n, 3, n_kind)
+        signs = _reflection_signs(is_odd) if template.half else np.ones((n_field, 3, 1))  # (n_field, 3, n_sign)
+        # Charge per area and stress component, shape (n, n_field, 3, n_sign, n_kind)
+        charge_factors = signs[..., None] * charge_per_probe_stress[:, None, :, None]
+        density = stress @ charge_factors.reshape(*stress.shape[:2], 3, -1).astype(stress.dtype)
 
-        # Order the axes as in `ChargeDensity.values`: from (press, field, node, sign and kind) to (sign, kind, press,
-        # element, node of the element, field).
-        shape = (*coefficients.shape[3:], position.size, template.n_element, -1, n_field)
+        # From (press, field, node, sign and kind) to (sign, kind, press, element, node, field), as in `ChargeDensity`
+        shape = (*charge_factors.shape[3:], position.size, template.n_element, -1, n_field)
         ordered_density = density.transpose(3, 0, 2, 1).reshape(shape)
         return ChargeDensity(position, self.probe, film.radius, template, placement, ordered_density)
 

@@ -190,33 +190,36 @@ class ElectrodePieces:
             Rules with the integration points of some pairs of a press and a piece. Together, the rules contain every
             pair.
         """
-        # Four arrays describe the pairs of a press and a piece, or of a press and a part of a piece. The first round
-        # has all pairs. Each further round has the parts into which near pieces are divided.
+        # Four arrays describe the pairs of a press and a piece, or of a press and a part of a piece: both indices, the
+        # corners, and the area (mm^2) that a line represents, which is zero for a quadrilateral. The first round has
+        # all pairs. Each further round has the parts into which near pieces are divided.
         near_count, distant_count = counts
-        film = self.surface_film
+        film = self.surface_film  # None if the stress is read in the middle of the film, not at an outer surface
         near_side = (NEAR_SIDE if film is None else NEAR_SURFACE_SIDE) * probe.half_width
-        press, piece = np.indices((position.size, len(self.corners))).reshape(2, -1)
-        corners = self.corners[piece]
-        line_area = self.line_area[piece]
-        while press.size:
+        press_index, piece_index = np.indices((position.size, len(self.corners))).reshape(2, -1)
+        corners = self.corners[piece_index]
+        line_area = self.line_area[piece_index]
+        while press_index.size:
             centre = corners.mean(axis=1)
             radius = np.abs(corners - centre[:, None]).max(axis=1)
-            is_near = np.abs(position[press] - centre) < NEAR_DISTANCE * (radius + probe.reach)
+            is_near = np.abs(position[press_index] - centre) < NEAR_DISTANCE * (radius + probe.reach)
             sides = np.abs(np.roll(corners, -1, axis=1) - corners)
             longest_side = sides.max(axis=1)
             is_halved = is_near & (longest_side > near_side)
             if film is not None:
                 rim_gap = film.radius * (1.0 - film.relative_distance(corners).max(axis=1))
                 is_halved |= longest_side > RIM_SIDE * np.maximum(rim_gap, film.thickness)
+                # This further condition gives a part beside the rim more points, but does not halve the part.
                 is_near |= longest_side > 0.5 * rim_gap
             for count, is_selected in ((near_count, is_near & ~is_halved), (distant_count, ~is_near & ~is_halved)):
                 # With longer chunks, the working arrays would exceed 100 MB.
                 for chunk in _chunks(np.flatnonzero(is_selected), 50_000 // count**2):
                     points, area = gauss_quadrilaterals(corners[chunk], line_area[chunk], count)
-                    yield PieceRule(press[chunk], piece[chunk], points, area)
+                    yield PieceRule(press_index[chunk], piece_index[chunk], points, area)
 
-            press = np.tile(press[is_halved], 2)
-            piece = np.tile(piece[is_halved], 2)
+            # Replace each halved part by its two halves.
+            press_index = np.tile(press_index[is_halved], 2)
+            piece_index = np.tile(piece_index[is_halved], 2)
             line_area = np.tile(0.5 * line_area[is_halved], 2)
             corners = halve_quadrilaterals(corners[is_halved])
 
@@ -250,6 +253,7 @@ def touch_charge(sensor: Sensor, equilibrium: Equilibrium) -> Array:
         )
     contact = np.array([[*equilibrium.at, equilibrium.force]])
     (pressure_charge,) = contact_charges(sensor, equilibrium.probe, contact)
+    # The charge has two parts, which the stress in the film and the contact pressure cause. `read` adds the crosstalk.
     return sensor.calibration.read(stress_charge(sensor, equilibrium) + pressure_charge)
 
 
@@ -267,8 +271,9 @@ def stress_charge(sensor: Sensor, equilibrium: Equilibrium, counts: tuple[int, i
         Charges, shape (n_electrode,), pC.
     """
     pieces = ElectrodePieces.of(sensor)
-    charge_per_stress = piece_charge_per_stress(sensor)
+    charge_per_stress = piece_charge_per_stress(sensor)  # one row for each kind of piece
     charge = np.zeros(len(sensor.electrodes))
+    # A rule contains the integration points and their areas for some pairs of the press and a piece.
     for rule in pieces.rules(equilibrium.probe, np.array([complex(*equilibrium.at)]), counts):
         # `touch_stress` expects one list of points.
         stress_of_points = touch_stress(equilibrium, to_corners(rule.points.ravel()), sensor.surface)
@@ -299,7 +304,7 @@ def contact_charges(sensor: Sensor, probe: Probe, contact: Array, orientation: A
     """
     force_shares = np.zeros((len(contact), len(sensor.electrodes)))  # fraction of the force that acts on each electrode
     if sensor.piezo.d33 == 0.0 or not len(contact):
-        return force_shares
+        return force_shares  # all shares are zero, and so are all charges
     position = contact[:, :2]
     force = contact[:, 2]
     rotation = np.broadcast_to(orientation, len(contact))
@@ -341,6 +346,9 @@ def thermal_charge(sensor: Sensor, step: float) -> Array:
 def _area_pieces(electrode: Electrode) -> Iterator[Piece]:
     """Divide the area of an electrode into quadrilaterals, and yield them one after the other.
 
+    All pieces have the kind 0, because the area readout has only one kind. Their `line_area` is zero, because only a
+    line needs a separate area.
+
     Args:
         electrode: Electrode over whose area the stress is averaged.
     """
@@ -376,7 +384,8 @@ def _edge_lines(electrode: Electrode, rotation: float) -> Iterator[Piece]:
         middle = 0.5 * (start + end)
         rotated_edge = complex(*(end - start)) * cmath.rect(1.0, rotation)
         is_horizontal = abs(rotated_edge.real) > abs(rotated_edge.imag)
-        kind = 1 if is_horizontal else 0  # row of `STRESS_WEIGHTS`: 0 for s11, 1 for s22
+        # The kind selects the stress: 0 for s11 on the left and right edges, 1 for s22 on the lower and upper edges.
+        kind = 1 if is_horizontal else 0
         for first, last in ((start, middle), (middle, end)):
             yield Piece(np.array([first, last, last, first]), line_area, kind)
 
@@ -409,7 +418,8 @@ class ChargeDensity:
 
         Each electrode consists of pieces. The integral over a piece is a sum over integration points. At a point, the
         charge per area is interpolated between the nodes of the element that contains the point. If only half of the
-        film is meshed, points in the other half are reflected into the meshed half.
+        film is meshed, points in the other half are reflected into the meshed half. Positions are complex numbers
+        x + iy.
 
         Args:
             pieces: Pieces of the electrodes.
@@ -424,19 +434,21 @@ class ChargeDensity:
         rotation_and_scale = np.exp(-1j * np.angle(self.position)) / self.film_radius
 
         # A rule contains the integration points and their areas, shape (n_pair, n_point), of some pairs of a press and
-        # a piece. In each pair, `press` and `piece` are the indices of the two.
+        # a piece, and the indices of the press and of the piece of each pair, shape (n_pair,).
         for rule in pieces.rules(self.probe, self.position):
-            press = rule.press[:, None]  # shape (n_pair, 1): the same press for all points of a pair
-            piece = rule.piece[:, None]
+            press_index = rule.press[:, None]  # shape (n_pair, 1): the same press for all points of a pair
+            piece_index = rule.piece[:, None]
 
             # Find the element of each point. All four arrays have the shape (n_pair, n_point).
-            points = rule.points * rotation_and_scale[press]
+            points = rule.points * rotation_and_scale[press_index]
             element, xi, eta, is_reflected = locate_points(self.placement[rule.press], self.template, points)
 
-            # Select the charge per area at the nodes of the element of each point. The arrays of indices are broadcast
-            # with each other, so the selection has the shape (n_pair, n_point, n_local, n_field).
-            sign = is_reflected.astype(np.intp)  # index on the first axis of `values`: 0 or 1
-            nodal_density = self.values[sign, pieces.kind[piece], press, element]
+            # Select the charge per area at the nodes of the element of each point. The axes of `values` are the side
+            # (0: meshed half, 1: reflected half), the kind of the piece, the press, the element, the node, and the
+            # field. The arrays of indices are broadcast with each other, so the selection has the shape (n_pair,
+            # n_point, n_local, n_field).
+            side_index = is_reflected.astype(np.intp)
+            nodal_density = self.values[side_index, pieces.kind[piece_index], press_index, element]
 
             # The weight of a node in the integral is the area of the point times the basis function of the node.
             basis_values = tensor_values(self.template.resolution.order, xi.ravel(), eta.ravel())
@@ -444,8 +456,9 @@ class ChargeDensity:
 
             # For each pair, sum over its points and over the nodes of their elements, which are combined in one axis.
             # Then add the charge of the piece to the charge of its electrode.
-            nodal_density = nodal_density.reshape(len(press), -1, n_field)  # shape (n_pair, n_point * n_local, n_field)
-            pair_weights = node_weights.reshape(len(press), 1, -1).astype(nodal_density.dtype)
-            pair_charge = pair_weights @ nodal_density  # shape (n_pair, 1, n_field)
+            n_pair = len(press_index)
+            pair_density = nodal_density.reshape(n_pair, -1, n_field)  # shape (n_pair, n_point * n_local, n_field)
+            pair_weights = node_weights.reshape(n_pair, 1, -1).astype(pair_density.dtype)
+            pair_charge = pair_weights @ pair_density  # shape (n_pair, 1, n_field)
             np.add.at(charge, (rule.press, pieces.electrode[rule.piece]), pair_charge[:, 0])
         return charge

@@ -73,10 +73,14 @@ def whole_film_map(
         SceneError: If some presses cannot exist.
         SolveError: If a press has no equilibrium.
     """
+    # The domain contains all presses up to the largest distance from the centre at which the map is valid. The largest
+    # force results in the largest footprint, which `probe.under` returns.
     settings = SolveSettings(resolution=COARSE_RESOLUTION)
     min_force, max_force = force_range
     domain = Domain(outermost_distance(sensor.film, probe.under(max_force)), force_range)
-    n_force = 2 + math.ceil(math.log(max_force / min_force))  # for a taut film, one for each factor of e is too few
-    count = NodeCount(COARSE_DISTANCES, n_force)
-    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, count, settings, executor=executor)
+
+    # One force for each factor of e would be too few for a taut film, so there are two more.
+    n_force = 2 + math.ceil(math.log(max_force / min_force))
+    node_count = NodeCount(COARSE_DISTANCES, n_force)  # numbers of distances and forces of the solved presses
+    forward_map = ForwardMap.build_unchecked(sensor, probe, domain, node_count, settings, executor=executor)
     return replace(forward_map, error=COARSE_ERROR)
