@@ -81,7 +81,10 @@ class Samples:
 
     @property
     def probes(self) -> tuple[str, ...]:
-        """Notations of the probes. If all presses of a probe have one rotation, the notation contains this rotation."""
+        """Notations of the probes. If all presses of a probe have one rotation, the notation contains this rotation.
+
+        The attribute `orientation_deg` contains the rotation of each press.
+        """
         notations = []
         for notation in np.unique(self.probe).tolist():
             rotations_deg = np.unique(self.orientation_deg[self.probe == notation])
@@ -265,7 +268,7 @@ def _check_samples(samples: Samples, n_electrode: int, shard_label: str) -> None
     # NumPy denotes the kind of the elements of an array by a letter: U for text, b for truth values, f for floats, and
     # i and u for signed and unsigned integers.
     kinds_and_content = {"probe": ("U", "text"), "outside": ("b", "truth values")}
-    numeric_kinds_and_content = ("fiu", "numbers")
+    numeric_kinds_and_content = ("fiu", "numbers")  # of all other columns; each of the three letters is allowed
     for name, column in columns.items():
         expected_kinds, expected_content = kinds_and_content.get(name, numeric_kinds_and_content)
         if column.dtype.kind not in expected_kinds:
@@ -284,7 +287,7 @@ def read_dataset(folder: StrPath) -> Dataset:
         folder: Folder of the dataset.
 
     Returns:
-        The dataset. Its manifest also contains the entries that this function ignores.
+        The dataset. Its manifest is the complete content of the file, including entries that are not checked here.
 
     Raises:
         DatasetError: If the folder is not a dataset, has a different format version, or is damaged or incomplete. The
@@ -353,7 +356,8 @@ def _read_manifest(folder: Path) -> tuple[dict[str, Any], str]:
         )
     data = read_needed(path, DatasetError, "make the dataset again", MAX_JSON_BYTES)
     with error_context(DatasetError, f"{path}: not a manifest of a dataset: "):
-        manifest = parse_json(data, "", DatasetError, dict[str, Any])  # the messages begin with the prefix above
+        # The second argument is the beginning of the messages. It is empty, because the block adds its own prefix.
+        manifest = parse_json(data, "", DatasetError, dict[str, Any])
         if "format_version" not in manifest:
             raise DatasetError("key 'format_version' is missing")
     version = manifest["format_version"]

@@ -105,6 +105,8 @@ class Sweep:
     def __post_init__(self) -> None:
         """Check the definition of the sweep.
 
+        The attributes `samples` and `outside` are the numbers of presses inside and outside the disk of the sweep.
+
         Raises:
             SceneError: If a value is not allowed.
         """
@@ -120,8 +122,8 @@ class Sweep:
 
     def contacts(self) -> Array:
         """Return the contacts (x, y, F) of a sweep with one probe, shape (n, 3), mm and N."""
-        first_stream = (0,)  # selects the random numbers of the first probe
-        contact, _ = self._draw(self.samples, first_stream, 0.0, self.radius)
+        # The contacts lie between the radii 0 and `radius`. The stream (0,) is that of the first probe.
+        contact, _ = self._draw(self.samples, 0.0, self.radius, stream=(0,))
         return contact
 
     def outside_presses(self, outer_radius: float) -> SweepPresses:
@@ -130,8 +132,8 @@ class Sweep:
         Args:
             outer_radius: Radius of the larger circle, mm.
         """
-        outside_stream = (0, 1)  # selects random numbers that no probe uses
-        contact, _ = self._draw(self.outside, outside_stream, self.radius, outer_radius)
+        # The stream (0, 1) selects random numbers that no probe uses.
+        contact, _ = self._draw(self.outside, self.radius, outer_radius, stream=(0, 1))
         return SweepPresses(np.full(self.outside, OUTSIDE_PROBE), contact, np.zeros(self.outside))
 
     def presses(self, probes: Sequence[Probe]) -> SweepPresses:
@@ -148,19 +150,21 @@ class Sweep:
         """
         if not probes:
             raise SceneError("probes: expected at least one, got none")
-        # Each probe has a stream of random numbers of its own.
-        probe_index = np.arange(self.samples) % len(probes)  # of each press
-        contact = np.empty((self.samples, 3))
-        rotation = np.zeros(self.samples)
+        probe_of_press = np.arange(self.samples) % len(probes)  # index of the probe of each press
+        contact = np.empty((self.samples, 3))  # (x, y, F) of each press, mm and N
+        rotation = np.zeros(self.samples)  # of each press, rad
         for index in range(len(probes)):
-            rows = np.flatnonzero(probe_index == index)
-            contact[rows], turn_fraction = self._draw(rows.size, (index,), 0.0, self.radius)
+            rows = np.flatnonzero(probe_of_press == index)
+            # The stream (index,) selects the random numbers of this probe, which no other probe uses.
+            contact[rows], turn_fraction = self._draw(
+                rows.size, inner_radius=0.0, outer_radius=self.radius, stream=(index,)
+            )
             if self.orientation == "random":
                 rotation[rows] = math.tau * turn_fraction
-        return SweepPresses(probe_index, contact, rotation)
+        return SweepPresses(probe_of_press, contact, rotation)
 
     def _draw(
-        self, count: int, stream: tuple[int, ...], inner_radius: float, outer_radius: float
+        self, count: int, inner_radius: float, outer_radius: float, stream: tuple[int, ...]
     ) -> tuple[Array, Array]:
         """Draw contacts between two circles around the centre of the film, and a rotation for each contact.
 
@@ -169,10 +173,10 @@ class Sweep:
 
         Args:
             count: Number of contacts.
-            stream: Numbers that are appended to the seed and select a stream of random numbers: `(index,)` for the
-                probe with this index, or `(0, 1)` for the presses outside the disk.
             inner_radius: Radius of the inner circle, mm.
             outer_radius: Radius of the outer circle, mm.
+            stream: Numbers that are appended to the seed. Different streams give independent random numbers. The stream
+                is `(index,)` for the probe with this index, and `(0, 1)` for the presses outside the disk.
 
         Returns:
             Contacts (x, y, F), shape (count, 3), mm and N. Rotations, shape (count,), in full turns.
@@ -225,7 +229,7 @@ def run_sweep(
         executor: Executor that runs the tasks, such as a process pool or the executor of a Dask cluster; None for this
             process. The files do not depend on the executor.
         maps: Forward map of each probe; empty if this function must build the maps.
-        shard: Number of samples in a shard, which is one file of the dataset.
+        shard: Largest number of samples in a shard, which is one file of the dataset.
 
     Returns:
         Path of the folder.
@@ -243,19 +247,23 @@ def run_sweep(
     if maps and [(each_map.sensor, each_map.probe) for each_map in maps] != [(sensor, probe) for probe in probes]:
         raise SceneError("maps: expected one forward map of this sensor for each probe, in the order of the probes")
 
-    # The presses are computed before files are written, because SciPy ignores an interrupt during this computation.
+    # SciPy ignores an interrupt while it draws the presses. They are therefore drawn before the folder exists.
     presses = sweep.presses(probes)
 
-    # BLAS is faster with one thread, because the matrices are small.
-    thread_title = "solving the film up to the clamp"
-    with new_folder(folder) as draft, single_threaded_blas(), second_thread(thread_title) as thread:
-        # The solves of the whole film keep the workers busy while this thread fits the maps of the probes.
-        outside_job = thread.submit(outside_map, sensor, probes, sweep, executor=executor)
-        maps = maps or solve_maps(sensor, probes, sweep, settings, executor=executor)
-        whole_film = outside_job.result()
-        shards = _divide_into_shards(sweep, presses, _shard_size(probes, shard), whole_film)
-        samples = _compute_samples(maps, whole_film, shards, executor)
-        write_files(draft, folder.name, sensor, samples, _manifest_entries(maps, whole_film, sweep))
+    # BLAS is faster with one thread, because the matrices are small. The files are written into a temporary folder,
+    # which becomes `folder` at the end of the block.
+    progress_title = "solving the film up to the clamp"
+    with new_folder(folder) as temporary_folder, single_threaded_blas(), second_thread(progress_title) as side_thread:
+        # A second thread builds the map of the whole film for the presses outside the radius. Its solves run on the
+        # workers of `executor`, and keep them busy while this thread fits the maps of the probes.
+        outside_job = side_thread.submit(outside_map, sensor, probes, sweep, executor=executor)
+        probe_maps = maps or solve_maps(sensor, probes, sweep, settings, executor=executor)
+        map_of_whole_film = outside_job.result()
+        shards = _divide_into_shards(sweep, presses, _shard_size(probes, shard), map_of_whole_film)
+        samples = _compute_samples(probe_maps, map_of_whole_film, shards, executor)  # iterator over the shards
+        write_files(
+            temporary_folder, folder.name, sensor, samples, _manifest_entries(probe_maps, map_of_whole_film, sweep)
+        )
     return folder
 
 
@@ -424,7 +432,7 @@ def _compute_samples(
         shards: Presses of each shard.
         executor: Executor that computes the charges; None to compute the charges in this process.
     """
-    # The index `OUTSIDE_PROBE` selects the last map.
+    # The map of the whole film comes last, because the index `OUTSIDE_PROBE` is -1.
     all_maps = list(maps) if whole_film is None else [*maps, whole_film]
     n_press = sum(map(len, shards))
     finished_presses = 0
@@ -442,7 +450,8 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses) -> Samp
         maps: Forward map of each probe, and of the whole film if presses lie outside the radius of the sweep.
         presses: Presses of the shard.
     """
-    # The index of a probe is also the index of its map. The index `OUTSIDE_PROBE` selects the last map.
+    # The index of a probe is also the index of its map. Presses outside the radius have the index `OUTSIDE_PROBE`,
+    # which is -1 and selects the last map.
     charge = np.empty((len(presses), len(maps[0].electrodes)))
     for index in np.unique(presses.probe).tolist():
         rows = np.flatnonzero(presses.probe == index)
@@ -451,7 +460,7 @@ def _samples_of_shard(maps: Sequence[ForwardMap], presses: SweepPresses) -> Samp
     probe_notations = np.array([forward_map.probe.notation for forward_map in maps])
     probe_angles = np.array([forward_map.probe.angle for forward_map in maps])
     x, y, force = presses.contact.T
-    rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)
+    rotation_deg = np.rad2deg(probe_angles[presses.probe] + presses.rotation)  # own orientation + additional rotation
     return Samples(
         x_mm=x,
         y_mm=y,

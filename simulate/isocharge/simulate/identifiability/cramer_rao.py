@@ -95,8 +95,8 @@ def _invert(information: Array) -> Array:
     Returns:
         Inverse matrices, shape (n, p, p).
     """
-    # The lower bound avoids a division by zero if there is no information about a parameter. The bound is the root of
-    # the smallest number, because the products of two bounds must not underflow.
+    # If there is no information about a parameter, its diagonal element is zero. A tiny lower bound then avoids a
+    # division by zero. The bound is the root of the smallest number, so that products of two bounds do not underflow.
     diagonal = np.diagonal(information, axis1=1, axis2=2)
     smallest_information = np.sqrt(np.finfo(float).tiny)
     parameter_scale = np.sqrt(np.maximum(diagonal, smallest_information))  # shape (n, p)

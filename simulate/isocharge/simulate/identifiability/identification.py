@@ -80,22 +80,23 @@ class LimitMap:
     def statistics(self) -> dict[str, float]:
         """Return a dictionary for JSON with the median, the root mean square and the maximum of the error limits.
 
-        Each position is weighted by the area that it represents. Errors of the force are in percent of the force.
+        The attributes `position` (mm) and `relative_force` contain the error limits of contacts on rings. Each limit is
+        weighted by the area that its contact represents. Errors of the force are in percent of the force.
         """
-        # Each position represents a part of a strip around its ring. All strips are as wide as the distance between the
-        # rings, so their areas are proportional to the radii and to the numbers 1, 2, ... of the rings. Half of the
-        # strip of the outermost ring lies outside the disk. For the median, each error is repeated in proportion to its
-        # area, so the areas must be integers: twice the number of the ring, but once the number for the outermost ring.
+        # Each position represents a part of a strip around its ring. All strips have the same width, so the area of a
+        # strip is proportional to the radius of its ring, and thus to the number 1, 2, ..., n_ring of the ring. Only
+        # half of the outermost strip lies inside the disk. Twice these areas are the integers 2, 4, ..., 2 (n_ring - 1)
+        # and n_ring. The median needs integers, because it repeats each error as often as its weight.
         n_ring, n_angle = self.position.shape
-        ring_area = np.append(2 * np.arange(1, n_ring), n_ring)
-        area = np.repeat(ring_area, n_angle)  # of each position, shape (n_ring * n_angle,)
+        ring_weight = np.append(2 * np.arange(1, n_ring), n_ring)
+        weight = np.repeat(ring_weight, n_angle)  # of each position, shape (n_ring * n_angle,)
         statistics = {"force_N": self.force}
         for quantity, unit, errors in (
             ("position", "mm", self.position.ravel()),
             ("force", "percent", 100.0 * self.relative_force.ravel()),
         ):
-            median = np.quantile(np.repeat(errors, area), 0.5, method="inverted_cdf")
-            root_mean_square = np.sqrt(np.average(errors**2, weights=area))
+            median = np.quantile(np.repeat(errors, weight), 0.5, method="inverted_cdf")
+            root_mean_square = np.sqrt(np.average(errors**2, weights=weight))
             statistics[f"{quantity}_median_{unit}"] = float(median)
             statistics[f"{quantity}_rms_{unit}"] = float(root_mean_square)
             statistics[f"{quantity}_worst_{unit}"] = float(errors.max())
@@ -139,7 +140,8 @@ class Identification:
     ) -> "Identification":
         """Compute how well the charges of a sensor determine the contacts in the domain of a forward map.
 
-        The mirror region is not computed.
+        The mirror region is not computed. The error limits are computed both on the whole disk of the forward map and
+        within the working area.
 
         Args:
             forward_map: Forward map of the sensor.
@@ -224,8 +226,8 @@ def identify(
         probe: Probe that presses the film.
         noise: Noise of the readings, with positive white noise. If None, the noise level is `reference`.
         force_range: Smallest and largest force, N.
-        radius: Distance from the centre up to which contacts are analysed, mm. If None, the distance is chosen by
-            `map_to_search`.
+        radius: Distance from the centre up to which contacts are analysed, mm. If None, `map_to_search` chooses the
+            distance of the outermost corner of an electrode, or a smaller distance if the map cannot reach it.
         error: Largest Cramer-Rao position error that is allowed in the working area, mm.
         executor: Executor that runs the solves; None to run the solves in this process.
 
@@ -264,7 +266,7 @@ def search_radius(sensor: Sensor, probe: Probe) -> float:
             f"{probe.notation}: expected a probe that can move on this film, which reaches less than "
             f"{largest_distance:.4g} mm from its centroid, got {probe.reach:.4g} mm; use a smaller probe"
         )
-    pads = [electrode.corners for electrode in sensor.electrodes]
+    pads = [electrode.corners for electrode in sensor.electrodes]  # without traces, which may extend to the clamp
     return min(outermost_corner(sensor, pads), largest_distance - probe.reach)
 
 
@@ -276,9 +278,9 @@ def map_to_search(
     *,
     executor: Executor | None = None,
 ) -> ForwardMap:
-    """Build the forward map that the search for the working area uses.
+    """Build the forward map in which the working area will be searched for.
 
-    If no radius is given, the first radius of the map is `search_radius`. If the charges cannot be interpolated
+    If no radius is given, a map with the radius `search_radius` is tried first. If the charges cannot be interpolated
     accurately up to this radius, the radius is multiplied by `RADIUS_REDUCTION`, at most `MAX_REDUCTIONS` times.
 
     Args:
@@ -305,9 +307,11 @@ def map_to_search(
             f"got {min_force:g} N twice"
         )
     if radius is None:
+        # Try the radii in descending order, and return the first map that can be built. The smallest radius is tried
+        # after this block, where a SolveError is not suppressed.
         first_radius = search_radius(sensor, probe.under(max_force))
-        radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
-        *larger_radii, radius = radii.tolist()  # the map with the smallest radius is built last
+        descending_radii = first_radius * RADIUS_REDUCTION ** np.arange(MAX_REDUCTIONS + 1.0)
+        *larger_radii, radius = descending_radii.tolist()
         for larger_radius in larger_radii:
             with suppress(SolveError):
                 return ForwardMap.build(sensor, probe, larger_radius, force_range, executor=executor)

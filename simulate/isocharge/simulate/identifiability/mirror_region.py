@@ -82,7 +82,7 @@ class MirrorRegion:
 
         Args:
             charges: Accurate charge map of the working area.
-            radius: Radius of the working area, mm.
+            radius: Radius of the working area, mm. The accurate map is restricted to this radius.
             whole_film: Charge map of the whole film.
             noise: Noise of the readings.
         """
@@ -139,6 +139,8 @@ class MirrorRegion:
 def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     """Return for each press outside a domain whether a press inside the domain has the same charges within the noise.
 
+    Such a press inside the domain is called the mirror of the press outside.
+
     Args:
         inside: Charge map of the domain.
         charge: Charges of the presses outside the domain, without noise, shape (n, n_electrode), pC.
@@ -150,7 +152,8 @@ def has_mirror(inside: ChargeMap, charge: Array, noise: NoiseModel) -> Booleans:
     contact, residual = search(inside, charge, noise.sigma(charge))
     is_same_charge = np.linalg.norm(residual, axis=1) < DETECTABLE_SIGMAS
 
-    # If a search stopped at the edge of the domain, the contact on the edge does not explain the charges.
+    # If a search stopped at the edge of the domain, the contact on the edge does not explain the charges. The unit
+    # coordinates are 1 at the edge, and `INTERIOR` is slightly less than 1.
     unit_x, unit_y, unit_log_force = inside.domain.to_unit(contact).T
     is_interior = (np.hypot(unit_x, unit_y) < INTERIOR) & (np.abs(unit_log_force) < INTERIOR)
     return np.asarray(is_same_charge & is_interior)
@@ -183,7 +186,8 @@ def mirror_region(
         The mirror region; None if there is no working area, if the working area reaches the clamp, or if the film
         cannot be solved up to the clamp. The last case is logged as a warning.
     """
-    round_probe = probe if probe.is_axisymmetric else Circle(probe.reach)
+    round_probe = probe if probe.is_axisymmetric else Circle(probe.reach)  # the reach is the radius of this circle
+    # The contact area of some probes grows with the force, so the largest force needs the most space.
     if not 0.0 < radius < outermost_distance(sensor.film, round_probe.under(charges.domain.force_range[1])):
         return None
     try:

@@ -85,8 +85,11 @@ def minimise(
 def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -> Array:
     """Take one damped Gauss-Newton step that does not leave the domain D, the unit disk times the interval [-1, 1].
 
+    Each of the n points belongs to an independent problem, which minimises the sum of squared residuals |r|^2.
+
     Args:
-        point: Points of D, shape (n, 3).
+        point: Point u = (x, y, z) of each problem in D, shape (n, 3). The coordinates x and y belong to the disk, and z
+            belongs to the interval.
         residual: Residuals r at the points, shape (n, k).
         slopes: Derivatives dr/du at the points, which are the transposed Jacobian J', shape (n, 3, k).
         damping: Damping relative to the mean of the diagonal of J'J, shape (n,).
@@ -100,17 +103,18 @@ def bounded_step(point: Array, residual: Array, slopes: Array, damping: Array) -
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
     matrix = matrix + damping[:, None, None] * trace * np.eye(3) / 3.0
 
-    # The equations change only for points on an edge of D: on the circle that bounds x and y, or at an end of the
-    # interval that bounds z.
+    # For points on an edge of D, `_along_edges` changes the equations: a step that would cross the edge runs along it.
+    # The edges are the circle that bounds x and y, and the ends of the interval that bounds z.
     x, y, z = point.T
     edge_coordinates = np.column_stack([np.hypot(x, y), np.abs(z)])  # 1 on the edge, shape (n, 2)
     is_on_edge = edge_coordinates > 1.0 - ROUNDING
-    rows = np.flatnonzero(is_on_edge.any(axis=1))
-    if rows.size:
-        # On the circle, (x, y, 0) is the unit normal. At an end of the interval, (0, 0, z) is the unit normal.
-        normals = point[rows, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-        normals[~is_on_edge[rows]] = 0.0
-        matrix[rows], gradient[rows] = _along_edges(normals, matrix[rows], gradient[rows], trace[rows])
+    on_edge = np.flatnonzero(is_on_edge.any(axis=1))  # indices of the points on an edge
+    if on_edge.size:
+        # On the circle, (x, y, 0) is the unit normal. At an end of the interval, (0, 0, z) is the unit normal. The
+        # normal of an edge on which a point does not lie is set to zero. The shape of `normals` is (m, 2, 3).
+        normals = point[on_edge, None] * np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        normals[~is_on_edge[on_edge]] = 0.0
+        matrix[on_edge], gradient[on_edge] = _along_edges(normals, matrix[on_edge], gradient[on_edge], trace[on_edge])
     step = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
     return into_unit_domain(point + step)
 
@@ -135,7 +139,7 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
         Modified matrices, shape (n, 3, 3), and modified gradients, shape (n, 3).
     """
     # An edge is active if the negative gradient, the direction in which f decreases, has an outward component.
-    outward = -(normals @ gradient[..., None])  # outward component for each edge, shape (n, 2, 1)
+    outward = -(normals @ gradient[..., None])  # outward component of -J'r for each edge, shape (n, 2, 1)
     active_normals = normals * (outward > 0.0)  # the normal of an inactive edge becomes zero
 
     # The circle is curved. After a motion by the angle a along the circle, the displacement is a t - a^2 n / 2, where n
@@ -143,7 +147,7 @@ def _along_edges(normals: Array, matrix: Array, gradient: Array, trace: Array) -
     # larger than t' J'J t by the outward component. Add the difference to the matrix.
     normal_x, normal_y, _ = active_normals[:, 0].T  # zeros if the circle is not active
     tangent = np.column_stack([-normal_y, normal_x, np.zeros_like(normal_x)])
-    circle_outward = outward[:, :1]  # shape (n, 1, 1)
+    circle_outward = outward[:, :1]  # positive if the circle is active; otherwise the tangent is zero, shape (n, 1, 1)
     matrix = matrix + circle_outward * tangent[:, :, None] * tangent[:, None, :]
 
     # Remove the components across the active edges from the gradient and from the matrix. The matrix would then be
@@ -174,25 +178,27 @@ CHUNK = 2048
 def explain(
     charge_map: ChargeMap, charge: Array, sigma: Array, start: Array, *, min_change: float = MIN_CHANGE
 ) -> tuple[Array, Array]:
-    """Find the contacts whose charges are nearest to given charges. The starting points may be anywhere.
+    """Find the contacts whose charges are nearest to given charges, starting from given contacts.
 
-    A least-squares descent leads from each starting point to a local minimum of the distance. The unknowns are x, y and
-    ln F in unit coordinates. In these coordinates, the domain is the unit disk times the interval [-1, 1].
+    The distance between charges is the norm of the residuals (Q - Q(c)) / sigma, where Q are the given charges and Q(c)
+    the charges of a contact c. A least-squares descent leads from each starting point to a local minimum of the
+    distance. The unknowns are x, y and ln F in unit coordinates. In these coordinates, the domain is the unit disk
+    times the interval [-1, 1].
 
     Args:
         charge_map: Map that computes the charges of contacts.
         charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
-        start: Contacts (x, y, F) from which the descents start, shape (n, 3), mm and N.
+        start: Contacts (x, y, F) from which the descents start, anywhere on the film, shape (n, 3), mm and N.
         min_change: A descent ends if the squared distance s of the charges changes by less than min_change * (1 + s).
 
     Returns:
         Contacts (x, y, F) within the domain of the map, shape (n, 3), mm and N. Residuals, which are the given charges
         minus the charges of the contacts, divided by `sigma`, shape (n, n_electrode), dimensionless.
     """
-    domain = charge_map.domain.within(INNER_RADIUS * charge_map.domain.radius)
+    domain = charge_map.domain.within(INNER_RADIUS * charge_map.domain.radius)  # smaller by a rounding error
     min_force, max_force = domain.force_range
-    scale = domain.scale  # derivatives of (x, y, ln F) with respect to the unit coordinates
+    scale = domain.scale  # new array: derivatives of (x, y, ln F) with respect to the unit coordinates, shape (3,)
     if min_force == max_force:  # the charges do not depend on the third unit coordinate
         scale[2] = 0.0
 
@@ -207,8 +213,9 @@ def explain(
             Residuals, shape (k, n_electrode). Their derivatives with respect to the unit coordinates, shape (k, 3,
             n_electrode).
         """
-        predicted, slopes = charge_map.linearised(_to_contact(domain, unit_coordinates))
-        derivatives = -slopes * scale / sigma[rows][..., None]  # shape (k, n_electrode, 3)
+        predicted, charge_derivatives = charge_map.linearised(_to_contact(domain, unit_coordinates))
+        # By the chain rule, the factor `scale` converts derivatives by (x, y, ln F) into those by unit coordinates.
+        derivatives = -charge_derivatives * scale / sigma[rows][..., None]  # of the residuals, (k, n_electrode, 3)
         return (charge[rows] - predicted) / sigma[rows], derivatives.swapaxes(1, 2)
 
     unit_solution, residual = minimise(residuals, domain.to_unit(start), min_change=min_change)
@@ -302,8 +309,8 @@ def starting_contacts(
         charge_map: Map that computes the charges of contacts.
         charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
-        starts: Number of starting points for each row of charges.
-        candidates: Number of candidates.
+        starts: Number of starting points that are returned for each row of charges.
+        candidates: Number of candidates among which the starting points are chosen.
 
     Returns:
         Contacts (x, y, F) with the nearest charges for each row, in ascending order of the distance between the
@@ -311,7 +318,7 @@ def starting_contacts(
     """
     # Compute the charges of the candidates, and find the pairs of candidates that lie close together.
     unit_candidates, is_neighbour = _unit_candidates(candidates)
-    contact = _to_contact(charge_map.domain, INNER_RADIUS * unit_candidates)
+    contact = _to_contact(charge_map.domain, INNER_RADIUS * unit_candidates)  # the factor is 1 - 1e-9
     candidate_charges = charge_map.charges(contact)
 
     start = np.empty((len(charge), starts, 3))
@@ -343,7 +350,7 @@ def _unit_candidates(count: int) -> tuple[Array, Booleans]:
     angle = math.tau * angle_sample
     position = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     log_force = 2.0 * force_sample - 1.0  # from the interval [0, 1] to [-1, 1]
-    distance = scipy.spatial.distance.cdist(position, position)
+    distance = scipy.spatial.distance.cdist(position, position)  # whatever the forces are
     return np.column_stack([position, log_force]), distance < START_SEPARATION
 
 
@@ -359,7 +366,8 @@ def _nearest_rows(
         charge: Given charges, shape (n, n_electrode), pC.
         sigma: Standard deviation of each charge, shape (n, n_electrode), pC.
         candidate_charges: Charges of the candidates, shape (n_candidate, n_electrode), pC.
-        is_neighbour: Whether each pair of candidates lies close together, shape (n_candidate, n_candidate).
+        is_neighbour: Whether each pair of candidates lies close together, shape (n_candidate, n_candidate). A candidate
+            is a neighbour of itself.
         count: Number of candidates to find for each row of charges.
 
     Returns:

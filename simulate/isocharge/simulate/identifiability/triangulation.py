@@ -78,14 +78,16 @@ class Triangulation:
     def locate(self, charge: Array) -> Fix:
         """Estimate the contact (x, y, F) of each press from its charges.
 
-        The contour of an electrode consists of the positions at which a press causes the given charge. The estimate is
-        the position that is nearest to the contours of all electrodes.
+        The contour of an electrode consists of the positions at which a press causes the given charge. The spread of a
+        position is its root mean square distance from the contours of all electrodes. The estimate is the position with
+        the smallest spread.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
 
         Returns:
-            The contacts. A contact is NaN if no position or more than one position agrees with the charges.
+            Contact and spread of each press. A contact is NaN if no position or more than one position agrees with the
+            charges.
 
         Raises:
             ChargeError: If the shape of the charges is wrong, or if a charge is not finite.
@@ -102,11 +104,14 @@ class Triangulation:
         largest_charge = np.abs(charge).max(axis=1, keepdims=True, initial=1.0)  # at least 1 pC
         equal_sigma = np.broadcast_to(largest_charge, charge.shape)  # all charges of a press have the same weight
         starts = starting_contacts(self.charge_map, charge, equal_sigma, starts=STARTS)  # shape (n, STARTS, 3)
-        contact_list, spread_list = self._descend(np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3))
-        contacts = contact_list.reshape(starts.shape)
-        spreads = spread_list.reshape(starts.shape[:2])  # shape (n, STARTS)
+        flat_contacts, flat_spreads = self._nearest_to_contours(
+            np.repeat(charge, STARTS, axis=0), starts.reshape(-1, 3)
+        )
+        contacts = flat_contacts.reshape(starts.shape)
+        spreads = flat_spreads.reshape(starts.shape[:2])  # shape (n, STARTS), mm
 
-        # Choose the best contact of each press, unless another contact is as good and lies elsewhere.
+        # Choose the contact with the smallest spread, unless another contact is as good and lies elsewhere. `TOLERANCE`
+        # limits both the distance between equal contacts and the spread of a valid contact, mm.
         press = np.arange(len(charge))
         best_search = spreads.argmin(axis=1)
         best_contact = contacts[press, best_search]
@@ -117,11 +122,12 @@ class Triangulation:
         best_contact[(best_spread > TOLERANCE) | is_ambiguous] = np.nan
         return Fix(best_contact, best_spread)
 
-    def _descend(self, charge: Array, contact: Array) -> tuple[Array, Array]:
+    def _nearest_to_contours(self, charge: Array, contact: Array) -> tuple[Array, Array]:
         """Find the contacts with the smallest mean square distance from the contours, starting from given contacts.
 
         The contour of an electrode consists of the positions at which a press causes the given charge. To first order,
-        the distance from the contour is the difference of the charges divided by the length of the gradient.
+        the distance from the contour is the difference of the charges divided by the length of the gradient. The
+        gradients change with the contact, so each round uses the gradients at the contacts of the previous round.
 
         Args:
             charge: Touch charges, shape (n, n_electrode), pC.
@@ -133,9 +139,10 @@ class Triangulation:
         """
         for _ in range(ROUNDS):
             _, derivatives = self.charge_map.linearised(contact)
-            gradient_length = np.linalg.norm(derivatives[..., :2], axis=2)  # shape (n, n_electrode), pC/mm
+            gradient = np.linalg.norm(derivatives[..., :2], axis=2)  # by x and y, shape (n, n_electrode), pC/mm
             # The lower bound keeps the distance finite where a charge has an extremum.
-            smallest_length = MIN_RELATIVE_SLOPE * gradient_length.max(axis=1, keepdims=True)
-            slope = np.maximum(gradient_length, smallest_length)
-            contact, distance = explain(self.charge_map, charge, slope, contact)
+            smallest_gradient = MIN_RELATIVE_SLOPE * gradient.max(axis=1, keepdims=True)
+            limited_gradient = np.maximum(gradient, smallest_gradient)
+            # `explain` minimises the sum of the squares of difference / limited_gradient, which are the distances.
+            contact, distance = explain(self.charge_map, charge, limited_gradient, contact)
         return contact, np.sqrt(np.mean(distance**2, axis=1))

@@ -62,27 +62,30 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         positions lie on fold lines. With more electrodes, folds are single points. The second array contains the
         position errors on the rings, shape (n_ring, n_angle), mm.
     """
-    radius = INNER_RADIUS * charge_map.domain.radius
+    radius = INNER_RADIUS * charge_map.domain.radius  # smaller by a rounding error
 
     def position_error(position: Array) -> Array:
         """Return the Cramer-Rao position error at positions of shape (..., 2), which is infinite at a fold."""
         contact = contacts_at(position.reshape(-1, 2), force)
         return limits_at(charge_map, contact, noise).position.reshape(position.shape[:-1])
 
-    # Refine the maxima of the error. In each round, the step is halved, and each position moves to the best of 25
-    # points: itself and the 24 points that are up to two steps away along x and y.
+    # The search for folds starts where the reciprocal of the error is small, because it is zero at a fold. The first
+    # step at each position is the distance of its farther neighbour on the rings, shape (n,), mm.
     error_on_rings = position_error(onto_disk(rings.position, radius))
     position, step = _starting_points(rings, 1.0 / error_on_rings)
+
+    # Refine the maxima of the error. In each round, the step is halved, and each position moves to the point with the
+    # largest error among 25 points: itself and the 24 points that are up to two steps away along x and y.
     grid_y, grid_x = np.indices((5, 5)) - 2  # from -2 to 2
     neighbours = np.column_stack([grid_x.ravel(), grid_y.ravel()])  # in steps, shape (25, 2)
     while step.max() > 0.05 * FOLD_WIDTH:
         step *= 0.5
         trial = onto_disk(position[:, None] + step[:, None, None] * neighbours, radius)  # shape (n, 25, 2)
-        best_trial = position_error(trial).argmax(axis=1)
-        position = trial[np.arange(len(trial)), best_trial]
+        largest_error = position_error(trial).argmax(axis=1)  # index of the point, shape (n,)
+        position = trial[np.arange(len(trial)), largest_error]
 
     # A position is on a fold if the charge map reverses its orientation between two opposite points of a small circle
-    # around the position. Four pairs of opposite points are tried.
+    # around the position. Four pairs of opposite points are tried. The angles of their first points cover half a turn.
     angle = np.pi * np.arange(4) / 4.0
     offset = 0.5 * FOLD_WIDTH * to_corners(np.exp(1j * angle))  # from the position to a point, shape (4, 2)
     opposite_points = np.stack([position[:, None] + offset, position[:, None] - offset])  # shape (2, n, 4, 2)
@@ -111,8 +114,8 @@ def _reverses_orientation(charge_map: ChargeMap, pairs: Array, force: float, noi
     """
     charge, jacobian = charge_map.linearised(contacts_at(pairs.reshape(-1, 2), force))
     scaled_jacobian = jacobian / noise.sigma(charge)[..., None]
-    first, second = scaled_jacobian.reshape(*pairs.shape[:-1], -1, 3)  # each of shape (..., n_electrode, 3)
-    determinant: Array = np.linalg.det(first.swapaxes(-1, -2) @ second)
+    jacobian_1, jacobian_2 = scaled_jacobian.reshape(*pairs.shape[:-1], -1, 3)  # each of shape (..., n_electrode, 3)
+    determinant: Array = np.linalg.det(jacobian_1.swapaxes(-1, -2) @ jacobian_2)
     return determinant < 0.0
 
 
@@ -138,7 +141,8 @@ def _starting_points(rings: Rings, precision: Array) -> tuple[Array, Array]:
     # Along a fold line, the precision has a kink: it decreases to zero and increases again. There may be no minimum at
     # the position nearest to the fold, because the precision also changes along the fold line. Two opposite neighbours
     # are therefore compared. Where the precision is smooth, it is about half of their sum. If it is at most a third of
-    # the sum, it has a kink, and the position is also chosen.
+    # the sum, it has a kink, and the position is also chosen. First, the neighbours on the same ring are compared, then
+    # those on the two adjacent rings.
     sum_along_ring = np.roll(precision, 1, axis=1) + np.roll(precision, -1, axis=1)
     is_chosen |= 3.0 * precision <= sum_along_ring
     sum_across_rings = precision[:-2] + precision[2:]
@@ -211,7 +215,7 @@ class AmbiguousPairs:
 
     @property
     def summary(self) -> str:
-        """Sentence about the pair whose outer contact is nearest to the centre of the film.
+        """Sentence about the pair whose outer contact is nearest to the centre of the film, which is the first pair.
 
         If there are no pairs, the property is an empty text.
         """
@@ -242,7 +246,7 @@ def find_ambiguous_pairs(
         charge_map: Map that computes the charges of contacts.
         noise: Noise of the readings.
         forces: Forces of the first contacts, N. The second contact of a pair may have any force of the map.
-        places: Number of positions, which are distributed evenly over the disk.
+        places: Number of positions of the first contacts, which are distributed evenly over the disk.
 
     Returns:
         The pairs, ordered by the distance of the outer contact from the centre. The outer contact is the contact that
@@ -254,6 +258,7 @@ def find_ambiguous_pairs(
     first_position = INNER_RADIUS * domain_radius * sunflower(places)
     contact = np.concatenate([contacts_at(first_position, force) for force in forces])  # shape (n, 3)
     charge = charge_map.charges(contact)
+    # The residual is the difference of the charges in standard deviations, shape (n, STARTS, n_electrode).
     second, residual = local_minima(charge_map, charge, noise.sigma(charge), starts=STARTS, min_change=1e-4)
     first = np.broadcast_to(contact[:, None], second.shape)  # shape (n, STARTS, 3), like `second`
 
@@ -353,7 +358,11 @@ class WorkingArea:
 
     @property
     def summary(self) -> str:
-        """Sentences that describe the working area and the reason for its radius."""
+        """Sentences that describe the working area and the reason for its radius.
+
+        The attribute `bound` is the reason: "error" if the position error exceeds the limit `error` (mm) beyond the
+        radius, "fold" or "twins" (an ambiguous pair), or "searched" if only the radius of the search bounds the area.
+        """
         min_force, max_force = self.force_range
         sentences = [f"Working area: up to {self.radius:.3g} mm from the centre, {min_force:g} to {max_force:g} N."]
         if self.bound == "error":
