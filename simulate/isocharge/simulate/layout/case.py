@@ -113,7 +113,8 @@ class DesignCase:
     def __post_init__(self) -> None:
         """Check the requirements.
 
-        A kept electrode is an electrode of the initial sensor that keeps its position.
+        The attribute `electrodes` is the number of electrodes of the new layout. A kept electrode is an electrode of
+        the initial sensor that keeps its position.
 
         Raises:
             InputError: If a value is not allowed, or the kept electrodes do not satisfy the rules.
@@ -266,8 +267,8 @@ class DesignCase:
         added to the noise.
 
         Args:
-            charges: Charges and their derivatives, with the columns `stress_fields.COLUMNS`, shape (n_press,
-                n_electrode, 6).
+            charges: Charge of each electrode, followed by its derivatives with respect to the five parameters in the
+                above order, shape (n_press, n_electrode, 6).
             nuisances: Standard deviations of the parameters that are not known exactly.
 
         Returns:
@@ -284,7 +285,8 @@ class DesignCase:
         """Create the sensor that has the kept electrodes and new squares at given positions.
 
         The new squares are named in anticlockwise order, beginning at the x axis. The electrodes of the sensor are
-        sorted by their names. The sensor is not calibrated, because a calibration belongs to the initial layout.
+        sorted by their names. The sensor is not calibrated, because a calibration belongs to the initial layout. In the
+        design case, `electrodes` is the number of all electrodes, and `keep` contains the names of the kept electrodes.
 
         Args:
             positions: Centres (x, y) of the new squares, shape (n, 2), mm.
@@ -296,9 +298,9 @@ class DesignCase:
             Electrode.of_square(name, (x, y), self.square_side)
             for name, (x, y) in zip(unused_names, anticlockwise.tolist(), strict=False)  # more names than squares
         ]
-        electrodes = tuple(sorted((*self.kept_electrodes, *squares), key=lambda electrode: electrode.name))
-        name = f"{self.sensor.name}-{self.electrodes}-over-{self.radius:g}mm"
-        return replace(self.sensor, name=name, electrodes=electrodes, calibration=Calibration())
+        all_electrodes = tuple(sorted((*self.kept_electrodes, *squares), key=lambda electrode: electrode.name))
+        sensor_name = f"{self.sensor.name}-{self.electrodes}-over-{self.radius:g}mm"  # as in "film-4-over-8mm"
+        return replace(self.sensor, name=sensor_name, electrodes=all_electrodes, calibration=Calibration())
 
     def to_dict(self) -> dict[str, Any]:
         """Return the requirements as a dictionary for JSON, without the sensor."""

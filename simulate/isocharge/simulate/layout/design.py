@@ -91,7 +91,8 @@ def random_layouts(case: DesignCase) -> list[Array]:
     Raises:
         InputError: If the squares do not fit.
     """
-    # Squares far outside the presses are of little use. They are only allowed if the squares do not fit otherwise.
+    # Squares far outside the presses are of little use. They are only allowed if the squares do not fit otherwise. The
+    # constant `EXTENT` is a share of the film radius.
     useful_radius = case.radius + EXTENT * case.sensor.film.radius
     allowed_radius = case.sensor.film.inner_radius - RIM_DISTANCE - 0.5 * case.square_side
     layouts = _layouts_within(min(useful_radius, allowed_radius), case) or _layouts_within(allowed_radius, case)
@@ -117,13 +118,13 @@ def _layouts_within(radius: float, case: DesignCase) -> list[Array]:
         Centres (x, y) of the squares of each layout, shape (n_new, 2), mm. The list is empty if a layout remains
         incomplete.
     """
-    points = radius * sunflower(1000)
+    points = radius * sunflower(1000)  # evenly distributed over the disk
     allowed_points = points[case.clearance(points) >= 0.0]
     rng = np.random.default_rng(case.seed)
     layouts = []
     for _ in range(STARTS):
         positions = np.empty((0, 2))
-        for point in rng.permutation(allowed_points):
+        for point in rng.permutation(allowed_points):  # has no effect when the layout is complete
             if len(positions) < case.new_count and (case.pair_clearance(positions, point[None]) >= 0.0).all():
                 positions = np.vstack([positions, point])
         if len(positions) < case.new_count:
@@ -145,9 +146,10 @@ class Search:
     fields: ForwardMap
 
     def error_map(self, sensor: Sensor) -> "ErrorMap":
-        """Compute the position errors of a sensor for the presses `DesignCase.fine_presses`.
+        """Compute the position errors of a sensor for many presses that cover the disk of the design case.
 
-        The errors are lower limits (Cramer-Rao). The electrodes are at their nominal positions.
+        The nuisance parameters are the probe radius, the pretension and the gains, which may not be known exactly. The
+        errors are lower limits (Cramer-Rao). The electrodes are at their nominal positions.
 
         Args:
             sensor: Sensor whose layout is evaluated.
@@ -186,12 +188,12 @@ class Search:
         return self.minimise(self.case.search_presses, start, power)
 
     def refine(self, layout: Layout) -> Layout:
-        """Reduce the largest error over `fine_presses`, and return the new layout and this error.
+        """Reduce the largest error over the many presses `fine_presses`, and return the positions with this error.
 
-        If the goal is the root-mean-square error, return the unchanged layout and its root-mean-square error.
+        If the goal is the root-mean-square error, return the unchanged positions with their root-mean-square error.
 
         Args:
-            layout: Layout for which the power mean of the errors of a few presses is small.
+            layout: Positions of the squares for which the power mean of the errors of a few presses is small.
         """
         best_positions = layout.positions
         best_errors = self.errors(best_positions)
@@ -262,7 +264,8 @@ class Search:
             charges = square_charges(positions)
             value = log_power_mean(charges)
 
-            # Move one square along one axis at a time. Only the charges of this square change.
+            # Move one square along one axis at a time. Only the charges of this square change. The charges of all moved
+            # squares are computed together. The steps are the vectors (DIFFERENCE_STEP, 0) and (0, DIFFERENCE_STEP).
             gradient = np.empty(positions.shape)
             for axis, step in enumerate(DIFFERENCE_STEP * np.eye(2)):
                 moved_charges = square_charges(positions + step)
@@ -389,11 +392,12 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
         InputError: If the electrodes do not fit on the film.
         SolveError: If a press has no equilibrium.
     """
-    # Improve random layouts, and refine the best layouts that are not rotations of each other.
-    starts = random_layouts(case)
+    # Improve random layouts, and refine the best of them. Layouts with nearly equal errors are taken for rotations of
+    # each other, so only one of them is kept.
+    random_starts = random_layouts(case)
     fields = solve_fields(case.sensor, case.probe, case.force, case.radius, executor)
     search = Search(case, fields)
-    improved_layouts = track(in_order(executor, search.optimum, starts), "improving", len(starts))
+    improved_layouts = track(in_order(executor, search.optimum, random_starts), "improving", len(random_starts))
     finalists: list[Layout] = []
     for layout in sorted(improved_layouts, key=lambda layout: layout.error):
         if not finalists or layout.error > finalists[-1].error * (1.0 + MIN_DIFFERENCE):
@@ -401,11 +405,12 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
     finalists = finalists[:MAX_FINALISTS]
     refined_layouts = track(in_order(executor, search.refine, finalists), "refining", len(finalists))
 
-    # Check the layouts in the order of their errors, up to the first layout that is not ambiguous. No layout can be
-    # checked if some presses cannot be solved, or if the forward map is not accurate.
+    # `case.layout` creates the sensor with the electrodes at the positions of a layout. Check the sensors in the order
+    # of their errors, up to the first one that is not ambiguous. No sensor can be checked if some presses cannot be
+    # solved, or if the forward map is not accurate. The first sensor is then chosen.
     layouts_by_error = sorted(refined_layouts, key=lambda layout: layout.error)
     sensors = [case.layout(np.round(layout.positions, DECIMALS)) for layout in layouts_by_error]
-    summaries = []
+    summaries = []  # one text for each checked sensor, or the reason why none can be checked
     try:
         forward_map = _solve_forward_map(case, executor)
     except (SceneError, SolveError) as error:
@@ -417,7 +422,8 @@ def design(case: DesignCase, *, executor: Executor | None = None) -> Design:
             if summary == UNAMBIGUOUS:
                 break
 
-    # If all layouts are ambiguous, choose the first layout, which has the smallest error.
+    # If all layouts are ambiguous, choose the first layout, which has the smallest error. Its index is also
+    # the number of rejected layouts.
     chosen = summaries.index(UNAMBIGUOUS) if UNAMBIGUOUS in summaries else 0
     errors_before = search.error_map(case.sensor) if len(case.sensor.electrodes) >= 3 else None
     errors_after = search.error_map(sensors[chosen])
@@ -454,7 +460,7 @@ def describe_ambiguities(case: DesignCase, charges: ChargeMap) -> str:
         `UNAMBIGUOUS` if there are no folds and no ambiguous pairs. Otherwise, a text with the distance of the nearest
         fold from the centre and the number of pairs.
     """
-    area = working_area(charges, case.noise, error=np.inf)
+    area = working_area(charges, case.noise, error=np.inf)  # the position error is not limited here
     findings = []
     if len(area.folds):
         findings.append(f"the map folds {area.fold_radius:.1f} mm from the centre")

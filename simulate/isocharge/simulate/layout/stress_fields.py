@@ -98,17 +98,22 @@ def charges_and_derivatives(fields: ForwardMap, presses: Array, electrodes: Sequ
 def charge_density(fields: ForwardMap, presses: Array) -> ChargeDensity:
     """Interpolate the stress fields at the positions of presses, and convert the stress to charge per area.
 
+    There are six stress fields: the stress itself, and its derivatives with respect to x, y, ln F, the probe radius and
+    the pretension. The array `COLUMN_IS_ODD` states which fields change their sign if the film is mirrored about the
+    direction of the press.
+
     Args:
-        fields: Stress fields that `solve_fields` returns. The domain of the fields must contain the presses.
+        fields: Forward map that `solve_fields` returns. The map interpolates the stress fields, and its domain must
+            contain the presses.
         presses: Positions (x, y) of the presses, shape (n, 2), mm.
 
     Returns:
         Charge per area and its derivatives, with one field for each of the `COLUMNS`.
     """
     position = to_complex(presses)
-    force = np.full(len(presses), fields.family.force[0])  # all presses have the same force
-    orientation = np.zeros(len(presses))
-    charge_per_stress = fields.sensor.piezo.charge_per_stress[None]  # one kind of piece, shape (1, 3)
+    force = np.full(len(presses), fields.family.force[0])  # the map was solved for a single force
+    orientation = np.zeros(len(presses))  # the probe is circular
+    charge_per_stress = fields.sensor.piezo.charge_per_stress[None]  # the same for all electrodes, shape (1, 3)
     return fields.charge_density(position, force, orientation, COLUMN_IS_ODD, charge_per_stress)
 
 
@@ -125,7 +130,7 @@ def electrode_charges(density: ChargeDensity, electrodes: Sequence[Electrode]) -
     """
     if not electrodes:
         return np.empty((density.position.size, 0, len(COLUMNS)))
-    charges = density.integrate(ElectrodePieces.covering(electrodes))
+    charges = density.integrate(ElectrodePieces.covering(electrodes))  # with the derivatives, in the order of `COLUMNS`
 
     # In the frame of the press, the columns x and y contain the derivatives along and across the direction of the
     # press. Rotate these two components of the gradient, as complex numbers, into the axes of the film.
@@ -140,44 +145,48 @@ def electrode_charges(density: ChargeDensity, electrodes: Sequence[Electrode]) -
 
 
 def _stress_and_derivatives(solved: Equilibrium, surface: Surface) -> Array:
-    """Compute the stress and its derivatives at the mesh nodes for one press, in the frame of the press.
+    """Compute the stress at the mesh nodes for one press, and its derivatives with respect to five parameters.
 
-    The derivatives refer to fixed points of the film, and are computed by finite differences between solved presses.
+    The parameters are x, y, ln F, the probe radius and the pretension. For each of them, the solver solves the press
+    again with a slightly larger and a slightly smaller value, and the stresses are subtracted. The mesh moves with the
+    press, but the derivatives refer to fixed points of the film.
 
     Args:
         solved: Equilibrium of the film under a press on the positive x axis.
         surface: Surface at which the stress is read: the middle, the top or the bottom of the film.
 
     Returns:
-        Stress (s11, s22, s12) and its derivatives in the order of `COLUMNS`, divided by the unit of the scaled stress,
-        shape (n_element, n_local, 6, 3).
+        Stress (s11, s22, s12) in the axes of the film, followed by its five derivatives, divided by the unit of the
+        scaled stress, shape (n_element, n_local, 6, 3).
     """
     stress = _stress_in_film_axes(solved, surface)
-    distance, _ = solved.at
+    distance, _ = solved.at  # the position of the press is (distance, 0), mm
     radius = solved.probe.reach
+    # Steps of x, y, ln F, probe radius and pretension. The steps of the three lengths are in units of the probe radius.
     steps = np.multiply(STEPS, [radius, radius, 1.0, radius, 1.0])
-    columns = [stress]
-    for column, step, changes in zip(COLUMNS[1:], steps, np.diag(steps), strict=True):
-        increased = _changed_press(solved, changes)
-        if column == "pretension":  # a one-sided difference, because the pretension may be zero
-            columns.append((_stress_in_film_axes(increased, surface) - stress) / step)
+    fields = [stress]
+    for parameter, step, changes in zip(COLUMNS[1:], steps, np.diag(steps), strict=True):
+        increased = _changed_press(solved, changes)  # only the change of this parameter is not zero
+        if parameter == "pretension":  # a one-sided difference, because the pretension may be zero
+            fields.append((_stress_in_film_axes(increased, surface) - stress) / step)
             continue
 
-        # The mesh turns with the direction of the press. Near the centre, this is a large angle: half a turn if a step
-        # in x crosses the centre, and more than 0.1 rad if the distance is less than ten steps in y.
+        # The mesh turns with the direction from the centre to the press. Near the centre, the angle is large: half a
+        # turn if a step in x crosses the centre, and more than 0.1 rad for a step in y if the distance is less than ten
+        # steps. Steps of the other parameters do not turn the mesh.
         decreased = _changed_press(solved, -changes)
-        distance_in_steps = {"x": 1.0, "y": 10.0}.get(column, 0.0)  # below which the angle is large; 0 for other steps
-        if distance < distance_in_steps * step:
-            # Both stresses are read at the nodes of the original mesh.
+        min_steps_from_centre = {"x": 1.0, "y": 10.0}.get(parameter, 0.0)
+        if distance < min_steps_from_centre * step:
+            # Both stresses are interpolated at the nodes of the original mesh.
             change = _change_at_fixed_points(solved, decreased, increased, surface)
         else:
-            # The nodes move with the press. Subtract the change of the stress that their movement causes.
+            # The nodes move a little with the press. Subtract the change of the stress that their movement causes.
             node_shift = _nodes_in_film_axes(increased) - _nodes_in_film_axes(decreased)
             change_at_nodes = _stress_in_film_axes(increased, surface) - _stress_in_film_axes(decreased, surface)
             change = change_at_nodes - change_by_node_shift(solved.mesh, stress, node_shift)
-        columns.append(change / (2.0 * step))
+        fields.append(change / (2.0 * step))
     stress_unit = solved.film.young * solved.groups.squared_amplitude
-    return np.stack(columns, axis=2) / stress_unit
+    return np.stack(fields, axis=2) / stress_unit
 
 
 def _changed_press(solved: Equilibrium, changes: Array) -> Equilibrium:

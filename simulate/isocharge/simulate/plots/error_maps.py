@@ -26,8 +26,9 @@ ERROR_LABEL = "lower limit of the position error (rms), mm"
 def identification_picture(identification: Identification) -> Figure:
     """Draw the lower limits of the position errors that `identify` has computed.
 
-    Two maps show the errors over the film for the smallest and the largest force. The colour scale of
-    both maps ends at the allowed error. A diagram shows the errors as a function of the distance from the centre.
+    Two maps show the errors over the film for the smallest and the largest force. The colour scale of both maps ends at
+    the allowed error. Red points mark folds, which are contacts at which the charges do not determine the contact. A
+    diagram shows the errors as a function of the distance from the centre.
 
     Args:
         identification: Result of `identify`.
@@ -35,15 +36,17 @@ def identification_picture(identification: Identification) -> Figure:
     Returns:
         Figure with the two maps and the diagram.
     """
-    area = identification.area
+    area = identification.area  # working area; `area.error` is the largest position error that is allowed in it, mm
     figure = new_figure(16.0, 5.2)
     *map_axes, distance_axes = figure.subplots(1, 3, width_ratios=(1.0, 1.0, 1.1))
     limit_maps = (identification.maps[0], identification.maps[-1])  # for the smallest and the largest force
-    smallest = min(limit_map.position.min() for limit_map in limit_maps)
-    norm = LogNorm(smallest, max(area.error, 2.0 * smallest))  # the scale must not be empty
+    # The attribute `position` of a map contains position errors (mm). The attribute `rings.position` contains the
+    # coordinates (x, y) of the presses (mm).
+    smallest_error = min(limit_map.position.min() for limit_map in limit_maps)
+    colour_scale = LogNorm(smallest_error, max(area.error, 2.0 * smallest_error))  # the scale must not be empty
     for axes, limit_map in zip(map_axes, limit_maps, strict=True):
-        positions = limit_map.rings.position.reshape(-1, 2)
-        coloured_area = _draw_errors(axes, identification.sensor, positions, limit_map.position.ravel(), norm)
+        presses = limit_map.rings.position.reshape(-1, 2)
+        coloured_area = _draw_errors(axes, identification.sensor, presses, limit_map.position.ravel(), colour_scale)
         axes.plot(*area.folds.T, ".", color=FELT, ms=3)
         draw_circle(axes, area.radius, ls="--", lw=1.8, color="white")
         folds = "; red: folds" if len(area.folds) else ""
@@ -62,7 +65,8 @@ def _draw_distance(axes: Any, identification: Identification) -> None:
 
     Args:
         axes: Axes of matplotlib.
-        identification: Result of `identify`, which contains a map of the errors for each force.
+        identification: Result of `identify`, which contains a map of the errors for each force. The attribute
+            `position` of such a map contains the position errors, shape (n_ring, n_angle), mm.
     """
     area = identification.area
     axes.set_prop_cycle(color=COLOURS)
@@ -102,14 +106,16 @@ def error_maps_picture(design: Design) -> Figure:
     if design.errors_before:
         layouts.insert(0, (case.sensor, design.errors_before))  # the map of the initial layout is on the left
 
-    # Both maps have the same colour scale and the same axes, which show all electrodes.
-    smallest = min(errors.with_nuisances.min() for _, errors in layouts)
-    norm = LogNorm(smallest, MAX_ERROR_RATIO * smallest)
+    # Both maps have the same colour scale and the same axes, which show all electrodes. Any of the coloured areas can
+    # therefore be used for the colour bar.
+    smallest_error = min(errors.with_nuisances.min() for _, errors in layouts)
+    colour_scale = LogNorm(smallest_error, MAX_ERROR_RATIO * smallest_error)
     figure = new_figure(6.4 * len(layouts) + 1.0, 6.0)
     all_axes = figure.subplots(1, len(layouts), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (sensor, errors) in zip(all_axes, layouts, strict=True):
         position_error = errors.with_nuisances  # shape (n_press,), mm
-        coloured_area = _draw_errors(axes, sensor, errors.presses, position_error, norm)
+        coloured_area = _draw_errors(axes, sensor, errors.presses, position_error, colour_scale)
+        # Mark the position (x, y) of the largest error by a cross.
         axes.plot(*errors.presses[np.argmax(position_error)], "x", color=FELT, ms=9, mew=2)
         draw_working_area(axes, case.radius)
         rms = np.sqrt(np.mean(position_error**2))
@@ -121,22 +127,22 @@ def error_maps_picture(design: Design) -> Figure:
     return figure
 
 
-def _draw_errors(axes: Any, sensor: Sensor, positions: Array, errors: Array, norm: LogNorm) -> Any:
+def _draw_errors(axes: Any, sensor: Sensor, presses: Array, errors: Array, colour_scale: LogNorm) -> Any:
     """Draw a map that shows the position errors as colours and the electrodes as outlines.
 
     Args:
         axes: Axes of matplotlib.
         sensor: Sensor with the electrodes.
-        positions: Positions (x, y) of the presses, shape (n, 2), mm.
+        presses: Positions (x, y) of the presses, shape (n, 2), mm.
         errors: Position error of each press, shape (n,), mm.
-        norm: Range of the colour scale.
+        colour_scale: Range of the colour scale.
 
     Returns:
         The coloured area of the map, for which a colour bar can be drawn.
     """
     draw_electrodes(axes, sensor)
     axes.set(xlabel="x, mm", ylabel="y, mm", aspect="equal")
-    return axes.tripcolor(*positions.T, errors, norm=norm, cmap="viridis", shading="gouraud")
+    return axes.tripcolor(*presses.T, errors, norm=colour_scale, cmap="viridis", shading="gouraud")
 
 
 def _add_colour_bar(figure: Figure, coloured_area: Any, axes: list[Any]) -> None:
@@ -157,17 +163,17 @@ def mirror_picture(sensor: Sensor, mirror: MirrorRegion) -> Figure:
 
     Args:
         sensor: Sensor whose mirror region is drawn.
-        mirror: Mirror region of the sensor.
+        mirror: Mirror region of the sensor, which was computed for several forces at each position.
 
     Returns:
-        Figure with the clamp, the working area and the electrodes. Shades show at each position the share of presses
-        that have the same charges as a press inside the working area.
+        Figure with the clamp, the working area and the electrodes. Shades show at each position the share of the forces
+        at which a press has the same charges as a press inside the working area.
     """
     figure = new_figure(7.4, 6.4)
     axes = figure.subplots()
 
     # Compute the corners x + iy of the cells, shape (n_ring + 1, n_sector + 1). A cell is the part of a ring in one
-    # sector.
+    # sector. The rings have the radii `mirror.edges`, from the working area (`mirror.inner`) outwards, mm.
     n_sector = mirror.share.shape[1]
     edge_angle = np.linspace(0.0, 2.0 * np.pi, n_sector + 1)
     corners = np.outer(mirror.edges, np.exp(1j * edge_angle))

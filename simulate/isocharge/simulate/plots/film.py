@@ -32,7 +32,7 @@ def draw_electrodes(axes: Any, sensor: Sensor, highlight: str = "", names: bool 
     """
     halo = [withStroke(linewidth=3.0, foreground="white", alpha=0.8)]  # separates dark lines from dark colours
     for electrode in sensor.electrodes:
-        colour = FELT if electrode.name == highlight else ink
+        colour = FELT if electrode.name == highlight else ink  # FELT is red
         for polygons, style in ((electrode.front, "-"), (electrode.back, "--")):
             for polygon in polygons:
                 corners = sensor.calibration.place(np.array(polygon))
@@ -160,7 +160,7 @@ def draw_section(axes: Any, equilibrium: Equilibrium) -> None:
     depth = deflection(equilibrium, section_points)
     axes.plot(distance_along_section, -depth, color=INK, lw=1.5)
 
-    # Mark the probe as a bar above the film, with an arrow to the deepest point.
+    # Mark the probe as a red bar above the film. An arrow points from the bar to the largest depth of the section.
     bar_height_mm = 0.25
     bar_ends = [distance - equilibrium.probe.reach, distance + equilibrium.probe.reach]
     axes.plot(bar_ends, [bar_height_mm, bar_height_mm], color=FELT, lw=5, solid_capstyle="butt")
