@@ -162,6 +162,9 @@ class Film:
     def __post_init__(self) -> None:
         """Check the properties of the film.
 
+        For each attribute, the table `FILM_NUMBERS` contains the key, the unit and the range of its value in a sensor
+        file, and the factor that converts the attribute into this unit.
+
         Raises:
             SensorError: If a property is outside its accepted range.
         """
@@ -226,6 +229,7 @@ class Piezo:
         """
         smallest, largest = PIEZO_LIMITS
         for name, coefficient in vars(self).items():
+            # The pyroelectric coefficient has another unit, pC/(mm^2 K), but the same limits.
             check_range(f"piezo {name}", coefficient, (-largest, largest), "pC/N", SensorError)
             may_be_tiny = name in ("pyro", "d12")  # d12 is an imperfection
             if not may_be_tiny and 0.0 < abs(coefficient) < smallest:
@@ -317,5 +321,5 @@ def add_anisotropy(film: Film, addition: complex) -> Film:
     if film.shear is None:
         log_ratio, axis = add_axial(log_ratio, film.axis, addition)
         return replace(film, young_ratio=math.exp(log_ratio), axis=axis)
-    log_ratio += (addition * cmath.rect(1.0, -2.0 * film.axis)).real
+    log_ratio += (addition * cmath.rect(1.0, -2.0 * film.axis)).real  # component along the axis of the film
     return replace(film, young_ratio=math.exp(log_ratio))

@@ -132,9 +132,10 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     Args:
         sensor: Sensor that is changed.
         probe: Probe that is changed. A probe that is not circular remains unchanged.
-        values: Value of each property by its name. The value of the pretension is the new pretension. Any other value
-            is a change: either a number that is added to the property, or the logarithm of a factor. Properties without
-            a value remain unchanged.
+        values: Value of each property by its name. Properties without a value remain unchanged. The value of the
+            pretension is the new pretension. The values of `young`, `thickness`, `d31`, `d32` and the gains are
+            logarithms of factors. The values of the uneven tensions are shares of the pretension. All other values are
+            added to the properties.
 
     Returns:
         The changed sensor and the changed probe.
@@ -142,8 +143,7 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     Raises:
         SensorError: If the changed sensor cannot exist, for example because an electrode lies over the rim.
     """
-    # Use the value 0, which changes nothing, for properties without a value, and keep the pretension if it has no
-    # value.
+    # A property without a value gets the value 0, which changes nothing. The pretension is kept if it has no value.
     value_of = defaultdict(float, {PRETENSION.name: sensor.film.pretension, **values})
     film = _changed_mechanics(sensor.film, value_of)
     piezo = replace(
@@ -154,20 +154,20 @@ def changed_film(sensor: Sensor, probe: Probe, values: Mapping[str, float]) -> t
     )
 
     # Change the gains and the positions of the electrodes.
-    described = sensor.calibration
-    gain = dict(described.gain)
+    calibration = sensor.calibration
+    gain = dict(calibration.gain)  # an electrode without an entry has the gain 1
     for name in sensor.electrode_names:
         log_factor = value_of[f"gain {name}"]
-        if log_factor:
+        if log_factor:  # an unchanged gain needs no new entry
             gain[name] = gain.get(name, 1.0) * math.exp(log_factor)
-    shift_x, shift_y = described.shift
-    calibration = Calibration(
+    shift_x, shift_y = calibration.shift
+    changed_calibration = Calibration(
         gain=gain,
         shift=(shift_x + value_of["shift_x"], shift_y + value_of["shift_y"]),
-        rotation=described.rotation + value_of["rotation"],
-        crosstalk=described.crosstalk + value_of["crosstalk"],
+        rotation=calibration.rotation + value_of["rotation"],
+        crosstalk=calibration.crosstalk + value_of["crosstalk"],
     )
-    changed_sensor = replace(sensor, film=film, piezo=piezo, calibration=calibration)
+    changed_sensor = replace(sensor, film=film, piezo=piezo, calibration=changed_calibration)
     if isinstance(probe, Circle):
         probe = replace(probe, radius=probe.radius + value_of["probe_radius"])
     return changed_sensor, probe
@@ -178,11 +178,14 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
 
     Args:
         film: Film that is changed.
-        value_of: Value of each property by its name. The value of the pretension is the new pretension. Any other value
-            is a change: either a number that is added to the property, or the logarithm of a factor.
+        value_of: Value of each property by its name. The value of the pretension is the new pretension (MPa). The
+            values of `young` and `thickness` are logarithms of factors. The uneven tensions are shares of the new
+            pretension, which are added to the deviator. The anisotropy of the stiffness and the oval shape of the
+            clamp each have a size and an axis. Their values with the endings x and xy are the size times the cosine and
+            the sine of twice the angle of the axis. They are added as the parts of a complex number.
     """
     pretension = value_of[PRETENSION.name]
-    difference, shear = film.deviator
+    half_difference, tension_shear = film.deviator  # (T11 - T22) / 2 and T12, MPa
     young_factor = math.exp(value_of["young"])
     oval, oval_axis = add_axial(film.oval, film.oval_axis, complex(value_of["oval_x"], value_of["oval_xy"]))
     return replace(
@@ -191,10 +194,10 @@ def _changed_mechanics(film: Film, value_of: Mapping[str, float]) -> Film:
         young=film.young * young_factor,
         thickness=film.thickness * math.exp(value_of["thickness"]),
         deviator=(
-            difference + value_of["tension_difference"] * pretension,
-            shear + value_of["tension_shear"] * pretension,
+            half_difference + value_of["tension_difference"] * pretension,
+            tension_shear + value_of["tension_shear"] * pretension,
         ),
-        shear=None if film.shear is None else film.shear * young_factor,
+        shear=None if film.shear is None else film.shear * young_factor,  # the shear modulus changes like the others
         oval=oval,
         oval_axis=oval_axis,
     )
@@ -237,14 +240,15 @@ class FilmPrior:
         """Declarations of all unknown properties, in the order of their values in a vector.
 
         The properties in `FILM_PROPERTIES` come first. The radius of a circular probe and the gains of the electrodes
-        follow.
+        follow. The number `std` is the uncertainty of the described value, and `drift` is the standard deviation of its
+        change between two calibrations.
         """
         # No electrode may reach the rim. A shift of the electrodes may use half of the gap between the electrodes and
         # the rim, and an oval clamp the other half. Each of them has two components. If both components have the
         # largest size, the length of their vector sum is sqrt(2) times this size.
         largest_shift = 0.5 * self._rim_gap / math.sqrt(2.0)  # mm
         largest_oval = largest_shift / self.sensor.film.radius  # relative to the radius of the film
-        largest_sizes = {
+        largest_size_of = {  # by the name of the property
             "shift_x": largest_shift,
             "shift_y": largest_shift,
             "oval_x": largest_oval,
@@ -253,7 +257,7 @@ class FilmPrior:
         properties = []
         for film_property in FILM_PROPERTIES:
             low, high = film_property.limits
-            largest_size = largest_sizes.get(film_property.name, math.inf)
+            largest_size = largest_size_of.get(film_property.name, math.inf)
             bounds = (max(low, -largest_size), min(high, largest_size))
             properties.append(replace(film_property, bounds=bounds))
 
@@ -264,7 +268,7 @@ class FilmPrior:
                 name="probe_radius",
                 meaning="radius of the probe",
                 unit="mm",
-                std=min(0.3, 0.3 * radius),
+                std=min(0.3, 0.3 * radius),  # 0.3 mm, but at most 30 % of the radius
                 drift=0.01,
                 bounds=(-largest_deviation, largest_deviation),
             )
@@ -274,9 +278,9 @@ class FilmPrior:
                 name=f"gain {name}",
                 meaning=f"ln of the gain of {name}",
                 unit="1",
-                std=0.05,
+                std=0.05,  # 5 %
                 drift=0.005,
-                bounds=(-1.5, 1.5),
+                bounds=(-1.5, 1.5),  # a factor of at most 4.5
             )
             properties.append(gain)
         return tuple(properties)
@@ -317,8 +321,8 @@ class FilmPrior:
 
         Changes of the electrodes and of the piezoelectric coefficients do not change the stress.
         """
-        # In each row, one property differs from its mean by one standard deviation. The stress can only change if the
-        # film or the probe changes.
+        # In each row, one property differs from its mean by one standard deviation, or by less at a bound. The stress
+        # can only change if the film or the probe changes.
         changed_values = np.clip(self.mean + np.diag(self.std), *self.bounds)
         mean_sensor, mean_probe = self.film(self.mean)
         changes = []
@@ -333,7 +337,7 @@ class FilmPrior:
         The sensor file may describe a film with imperfections. The value of an imperfection is its deviation from the
         sensor file, so a value of zero leaves the described imperfection unchanged. The returned value of each
         imperfection is the described imperfection with the opposite sign, so that both cancel. A shear modulus in the
-        sensor file remains unchanged.
+        sensor file remains, because no imperfection describes it.
 
         Args:
             values: Values of the properties, shape (n_property,).
@@ -344,20 +348,22 @@ class FilmPrior:
         # Collect the imperfections of the described film, in the units of the properties. The components of a property
         # with an axis are its size times the cosine and the sine of twice the angle of the axis.
         film = self.sensor.film
-        stiffness = cmath.rect(math.log(film.young_ratio), 2.0 * film.axis)
+        stiffness = cmath.rect(math.log(film.young_ratio), 2.0 * film.axis)  # complex number with both components
         oval = cmath.rect(film.oval, 2.0 * film.oval_axis)
-        described = {
+        described_imperfections = {
             "stiffness_x": stiffness.real,
             "stiffness_xy": stiffness.imag,
             "oval_x": oval.real,
             "oval_xy": oval.imag,
         }
+        # The value of an uneven tension times the given pretension is added to the described deviator (MPa). The value
+        # must therefore cancel the deviator divided by this pretension. Without a pretension, no value has an effect.
         pretension = values[self.index(PRETENSION.name)]
-        if pretension > 0.0:  # uneven tensions are shares of the mean pretension
-            described |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
+        if pretension > 0.0:
+            described_imperfections |= dict(zip(UNEVEN_TENSIONS, np.divide(film.deviator, pretension), strict=True))
 
         # The values of all other properties are kept.
-        cancelling_values = [-described.get(name, 0.0) for name in self.names]
+        cancelling_values = [-described_imperfections.get(name, 0.0) for name in self.names]
         return np.where(self.is_imperfection, cancelling_values, values)
 
     def film(self, values: Array) -> tuple[Sensor, Probe]:
@@ -384,12 +390,12 @@ class FilmPrior:
         Returns:
             Values of the properties of each film, shape (count, n_property).
         """
-        deviation = rng.standard_normal((count, len(self.properties)))
+        deviation = rng.standard_normal((count, len(self.properties)))  # from the mean, in standard deviations
         while (is_far := np.abs(deviation) > MAX_DRAWN_DEVIATION).any():
             deviation = np.where(is_far, rng.standard_normal(deviation.shape), deviation)
         deviation[:, self.is_imperfection] = 0.0
         values = self.mean + self.std * deviation
-        values[:, self.index(PRETENSION.name)] = LARGEST_PRETENSION * rng.random(count)
+        values[:, self.index(PRETENSION.name)] = LARGEST_PRETENSION * rng.random(count)  # uniform instead of normal
         low, high = self.bounds
         return np.clip(values, low, high)
 

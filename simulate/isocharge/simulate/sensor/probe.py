@@ -249,7 +249,7 @@ class Polygon(Probe):
             SceneError: If the corners do not form a convex polygon, or if the polygon is too small.
         """
         corners = np.array(self.corners, dtype=float)
-        are_points = corners.shape[1:] == (2,) and np.isfinite(corners).all()
+        are_points = corners.shape[1:] == (2,) and np.isfinite(corners).all()  # shape (n, 2)
         if not (are_points and 3 <= len(corners) <= MAX_CORNERS):
             raise SceneError(f"probe: expected 3 to {MAX_CORNERS} corners (x, y), got {cut(str(self.corners))}")
         check_angle(self.angle)
@@ -291,6 +291,7 @@ class Polygon(Probe):
         check_length("probe height", height)
         x = 0.5 * width
         y = 0.5 * height
+        # The arguments are the corners, the rotation and the notation of the rectangle.
         return cls(((x, y), (-x, y), (-x, -y), (x, -y)), angle, f"rectangle:{tidy(width)}x{tidy(height)}")
 
     @classmethod
@@ -392,16 +393,17 @@ def parse_probe(text: str) -> Probe:
     Raises:
         SceneError: If the text is not the notation of a probe, or if the footprint cannot exist.
     """
-    for notation, create in PROBE_SHAPES.items():
-        # Convert the notation into a regular expression. A polygon may have more corners. Each word of capital letters
-        # stands for a number.
+    for notation, create_probe in PROBE_SHAPES.items():
+        # Convert the notation, such as "rectangle:WIDTHxHEIGHT" or "polygon:X,Y;X,Y;X,Y", into a regular expression. A
+        # polygon may have more corners. Each word of capital letters stands for a number. The lambda inserts the
+        # pattern unchanged, whereas `re.sub` would interpret the backslashes of a replacement text.
         with_more_corners = notation.replace(";X,Y;X,Y", "(?:;X,Y)+")
         shape_pattern = re.sub("[A-Z]+", lambda _: NUMBER_PATTERN, with_more_corners)
         match = re.fullmatch(f"({shape_pattern})(?:@({NUMBER_PATTERN}))?", text.strip())
         if match is not None:
             shape, degrees = match.groups()
-            lengths = map(float, re.findall(NUMBER_PATTERN, shape))
-            probe = create(*lengths)
+            numbers = map(float, re.findall(NUMBER_PATTERN, shape))  # lengths or coordinates, mm
+            probe = create_probe(*numbers)
             return probe.rotated(math.radians(float(degrees or 0.0)))
     forms = [f"'{notation}'" for notation in PROBE_SHAPES]
     raise SceneError(

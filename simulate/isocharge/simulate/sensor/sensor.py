@@ -133,13 +133,15 @@ class Electrode:
             SensorError: If the path has too few or too many points, if it repeats a point or turns back, or if the
                 trace crosses itself.
         """
-        where = f"trace of electrode {self.name!r}"
+        where = f"trace of electrode {self.name!r}"  # first words of the error messages
         if not 2 <= len(path) <= MAX_CORNERS // 2:
             raise SensorError(f"{where}: expected 2 to {MAX_CORNERS // 2} points (x, y), got {shown(path)}")
+        # The outline has one corner on the right of each point of the path, and then one on the left of each point. The
+        # corners are NaN at two successive points that are equal, and at a point at which the path turns back.
         outline = trace_outline(to_complex(np.array(path)), width)
-        is_undefined = np.isnan(outline[: len(path)])
-        if is_undefined.any():
-            first = int(is_undefined.argmax())
+        is_bad_point = np.isnan(outline[: len(path)])
+        if is_bad_point.any():
+            first = int(is_bad_point.argmax())
             raise SensorError(
                 f"{where}: expected a path that neither repeats a point nor turns back, got {path[first]} mm as point "
                 f"{first + 1}"
@@ -157,7 +159,8 @@ class Electrode:
         """Side length of a square electrode with sides parallel to the axes, mm; None for any other electrode.
 
         The corners of the square must begin at the lower left and follow anticlockwise, as `of_square` creates them.
-        The square must be the only metal on the front, and the back must be completely covered with metal.
+        The square must be the only metal on the front (no polygons in `more`). The back must be completely covered with
+        metal (no polygons in `back`).
         """
         has_other_polygons = self.more or self.back
         if has_other_polygons or len(self.corners) != 4:
@@ -167,8 +170,8 @@ class Electrode:
         (lower_left_x, _), (lower_right_x, _), *_upper_corners = self.corners
         side = lower_right_x - lower_left_x
         square = Electrode.of_square(self.name, self.centre, side)
-        rounding_error = 1e-9 * side
-        is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=rounding_error)
+        tolerance = 1e-9 * side  # for rounding errors
+        is_square = side > 0.0 and np.allclose(self.corners, square.corners, rtol=0.0, atol=tolerance)
         return side if is_square else None
 
     @property
@@ -180,8 +183,8 @@ class Electrode:
     def collecting_polygons(self) -> tuple[Array, ...]:
         """Non-overlapping polygons that together form the collecting area of the electrode.
 
-        The collecting area consists of one convex polygon or of several triangles. The corners (x, y) of a polygon are
-        an array of shape (n, 2), mm.
+        The collecting area consists of one convex polygon, the pad, or of several triangles. The corners (x, y) of a
+        polygon are an array of shape (n, 2), mm.
 
         Raises:
             SensorError: If a polygon crosses itself, or if the number of corners is too small or too large.
@@ -195,7 +198,7 @@ class Electrode:
                 f"electrode {self.name!r}: expected at most {MAX_ELECTRODE_CORNERS} corners of all polygons, got "
                 f"{count}"
             )
-        if self._is_convex:
+        if self._is_convex:  # the pad is convex, and it is the only metal on the front, with a complete back
             return (np.array(self.corners),)
 
         # Charge is collected where metal on the front overlaps metal on the back. Without polygons on the back, the
@@ -310,7 +313,8 @@ class Sensor:
         Raises:
             SensorError: If a value is not allowed, or if an electrode overlaps another electrode or the rim.
         """
-        object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))  # the dataclass is frozen
+        # A list of electrodes becomes a tuple, which can be compared and hashed. The dataclass is frozen.
+        object.__setattr__(self, "electrodes", _as_tuples(self.electrodes))
 
         # Check the readout and the surface, the names of the electrodes, and the calibration.
         for value, options in ((self.readout, get_args(Readout)), (self.surface, get_args(Surface))):
@@ -427,7 +431,7 @@ def _check_layout(electrodes: tuple[Electrode, ...]) -> None:
     """
     for electrode in electrodes:
         name = f"electrode {electrode.name!r}"
-        if not electrode.collecting_polygons:
+        if not electrode.collecting_polygons:  # this property also checks that no polygon crosses itself
             raise SensorError(f"{name}: its front and its back have no area in common, so nothing collects; move one")
         corners = np.array(electrode.corners)
         check_range(name, float(np.ptp(corners, axis=0).max()), (MIN_EXTENT, np.inf), "mm", SensorError)
@@ -454,7 +458,7 @@ def _check_on_film(electrode: Electrode, film: Film, calibration: Calibration) -
     relative_distance = film.relative_distance(to_complex(placed_corners))  # 1 on the rim
     if not (relative_distance < 1.0).all():
         x, y = placed_corners[np.argmax(relative_distance)]
-        hint = "; end its traces before the rim" if electrode.more else ""
+        hint = "; end its traces before the rim" if electrode.more else ""  # further polygons, mostly traces
         raise SensorError(
             f"electrode {electrode.name!r} lies outside the film: corner ({x:.6g}, {y:.6g}) mm, film radius "
             f"{film.rim_distance(np.arctan2(y, x)):.6g} mm{hint}"
@@ -475,6 +479,7 @@ def check_polygon(where: str, polygon: Corners) -> None:
     corners = np.array(polygon)
     if corners.shape[1:] != (2,) or not 3 <= len(corners) <= MAX_CORNERS:
         raise SensorError(f"{where}: expected 3 to {MAX_CORNERS} corners (x, y), got {shown(corners.tolist())}")
+    # The function `is_simple` returns False if the polygon crosses itself, or if its corners are clockwise.
     if not (np.isfinite(corners).all() and is_simple(corners)):
         raise SensorError(
             f"{where}: expected a polygon that does not cross itself, with its corners anticlockwise, got "

@@ -124,8 +124,9 @@ class SensorTable(Settings, frozen=True):
     def __post_init__(self) -> None:
         """Check the section `electrodes`.
 
-        Most keys of the section `electrodes` are the names of the electrodes. The value of the key `SIDE` is a number
-        that applies to all squares.
+        Most keys of the section `electrodes` are the names of the electrodes. The value of a square electrode is its
+        centre, a tuple (x, y). The value of any other electrode is a PolygonTable. The value of the key `SIDE` is the
+        side of all squares, a float.
 
         Raises:
             WrongKey: If a value is not allowed, or if a key is missing.
@@ -273,7 +274,8 @@ def film_to_dict(film: Film) -> dict[str, Any]:
         root_of_ratio = math.sqrt(film.young_ratio)
         values["young"] = (film.young * root_of_ratio, film.young / root_of_ratio)
 
-    # Convert all values into the units of the file.
+    # Convert all values into the units of the file: `number.factor` is the unit of `Film` divided by the unit of the
+    # file. The function `_tidy_all` removes the rounding errors of the conversion.
     table = {
         number.key: _tidy_all(np.multiply(values[attribute], number.factor).tolist())
         for attribute, number in FILM_NUMBERS.items()
@@ -344,7 +346,7 @@ def _electrode_tables(sensor: Sensor) -> dict[str, Any]:
         raise SensorError(
             f"readout 'edge' needs squares, and in a sensor file all squares have one side: got {sides} mm"
         )
-    tables: dict[str, Any] = {}
+    tables: dict[str, Any] = {}  # the key `SIDE` cannot be the name of an electrode
     if sides:
         tables[SIDE] = next(iter(sides.values()))  # side of the first square
     for electrode in sensor.electrodes:
@@ -389,7 +391,8 @@ def _film(table: FilmTable) -> Film:
     values["pretension_MPa"] = 0.5 * (tension_11 + tension_22)
     deviator = (0.5 * (tension_11 - tension_22), tension_12)
 
-    # Convert all numbers into the units of `Film`, without optional properties that the file omits.
+    # Convert all numbers into the units of `Film`. An attribute of `Film` times `number.factor` is the number in the
+    # file. Optional properties that the file omits are None. The thermal expansion, which may be a list, follows below.
     numbers = {
         attribute: values[number.key] / number.factor
         for attribute, number in FILM_NUMBERS.items()
@@ -412,16 +415,18 @@ def _along_axes(value: float | list[float]) -> list[float]:
     return value if isinstance(value, list) else [value, value]
 
 
-def _electrodes(table: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
+def _electrodes(section: Mapping[str, float | Point | PolygonTable]) -> Iterator[Electrode]:
     """Yield the electrodes that the section `electrodes` of a sensor file describes, one after the other.
 
-    A value of the section is a table of polygons, the centre of a square, or the side of all squares.
+    A value of the section is a PolygonTable, the centre (x, y) of a square, or the side of all squares, which belongs
+    to the key `SIDE`. A PolygonTable contains the pad on the front, and optionally further polygons on the front
+    (`more_mm`), polygons on the back (`back_mm`), and the centre line and the width of a trace.
 
     Args:
-        table: Content of the section `electrodes`.
+        section: Content of the section `electrodes`. If it contains squares, it also contains their side.
     """
-    side = table.get(SIDE)  # side of all squares, mm
-    for name, value in table.items():  # the value of SIDE is a number and yields no electrode
+    side = section.get(SIDE)  # side of all squares, mm; None without squares
+    for name, value in section.items():  # the value of SIDE is a number and yields no electrode
         if isinstance(value, PolygonTable):
             electrode = Electrode(name, value.polygon_mm, more=value.more_mm, back=value.back_mm)
             if value.trace_mm:
