@@ -113,7 +113,8 @@ def write_design(design: Design, folder: Path) -> None:
         OutputError: If the files cannot be written.
     """
     case = design.case
-    errors = design.errors_after.to_dict()["with_nuisances"]  # includes the errors by uncertain nuisance parameters
+    # Errors of the new layout if the nuisance parameters (probe radius, pretension and gains) are uncertain
+    errors = design.errors_after.to_dict()["with_nuisances"]
     sensor_comment = [
         f"Positions searched for {case.electrodes} electrodes over {case.radius:g} mm, goal {case.goal}:",
         f"lower limit of the position error {errors['worst_mm']:.3f} mm at worst, {errors['rms_mm']:.3f} mm rms.",

@@ -45,9 +45,10 @@ POLL_INTERVAL_s = 0.005
 
 
 def in_order(executor: Executor | None, function: Callable[[Job], Result], jobs: Iterable[Job]) -> Iterator[Result]:
-    """Call a function with every job, and yield the results in the order of the jobs.
+    """Call a function with every job, in parallel in an executor, and yield the results in the order of the jobs.
 
-    A job is requested from the iterable only when it can be submitted to the executor.
+    A job is requested from the iterable only when it can be submitted to the executor. At most `MAX_PENDING` jobs are
+    submitted whose results have not been yielded yet.
 
     Args:
         executor: Executor that runs the jobs, such as a process pool with any start method, a thread pool, or
@@ -69,8 +70,8 @@ def in_order(executor: Executor | None, function: Callable[[Job], Result], jobs:
         with _executor_errors():
             for job in jobs:
                 pending.append(executor.submit(task, job))
-                # Yield the oldest result if too many jobs are pending, or if all pending jobs are done. In the second
-                # case, the results are available without waiting.
+                # Yield the oldest result while too many jobs are pending, or while all pending jobs are done. In the
+                # first case, this loop may wait for the oldest job. In the second case, no waiting is necessary.
                 while pending and (len(pending) >= MAX_PENDING or all(future.done() for future in pending)):
                     yield pending.popleft().result()
             while pending:
@@ -154,11 +155,11 @@ def local_workers(count: int) -> Iterator[Executor | None]:
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_initialise_worker)
     try:
         yield pool
-    except BaseException:  # includes KeyboardInterrupt; running jobs are not completed
-        _abandon(pool)
+    except BaseException:  # includes KeyboardInterrupt
+        _abandon(pool)  # kills the workers, so that `shutdown` does not wait for running jobs
         raise
     finally:
-        pool.shutdown(cancel_futures=True)
+        pool.shutdown(cancel_futures=True)  # waits until all workers have ended
 
 
 def _abandon(pool: ProcessPoolExecutor) -> None:
@@ -191,7 +192,8 @@ def _abandon(pool: ProcessPoolExecutor) -> None:
     # `_cancel_pending_futures`.
     _wait_until(lambda: not internals._cancel_pending_futures or not manager.is_alive())
 
-    # End the workers, and wait until the manager has noticed that they ended.
+    # End the workers, and wait until the manager has noticed that they ended. This process closes its
+    # writing end of the pipe of the results, so that the manager does not wait for the rest of a result.
     for worker in workers:
         worker.kill()
     result_queue._writer.close()

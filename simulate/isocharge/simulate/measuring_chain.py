@@ -139,6 +139,9 @@ class Measurement:
     def __init__(self, amplifier: Amplifier, electrodes: int, rate: float, rng: np.random.Generator) -> None:
         """Draw the properties of the channels and the initial temperatures, and set all charges to stationary values.
 
+        Each channel has its own time constant of the leak (s), gain, bias current (pC/s), offset (pC), phase of the hum
+        (rad) and pyroelectric charge (pC/K).
+
         Args:
             amplifier: Parameters of the measuring chain.
             electrodes: Number of electrodes, each of which has one channel.
@@ -148,7 +151,7 @@ class Measurement:
         self.amplifier = amplifier
         self.rate = rate
         self.rng = rng
-        self._readings = 0
+        self._reading_count = 0  # number of readings of all blocks so far
 
         # Do not change the order of the statements, because it determines which random numbers each property gets.
         self.leak_time = amplifier.tau * (1.0 + amplifier.tau_mismatch * rng.standard_normal(electrodes))
@@ -162,9 +165,10 @@ class Measurement:
         if amplifier.pyro_mismatch:
             self.pyro_charge_per_K *= 1.0 + amplifier.pyro_mismatch * rng.standard_normal(electrodes)
 
-        # Draw the temperatures of the film and of the air. The film follows the air as a low-pass filter, so both are
-        # correlated. If the correlation is c, the standard deviation of the film is also c times that of the air. The
-        # film must have the standard deviation `temperature_rms`, so the air has `temperature_rms / c`.
+        # Draw the temperatures of the film and of the air, relative to their mean (K). The film follows the air as a
+        # low-pass filter. Let c be the correlation of both temperatures. The standard deviation of the film is then c
+        # times that of the air. The film has the standard deviation `temperature_rms`, so the air has
+        # `temperature_rms / c`.
         common_part, independent_part = amplifier.temperature_rms * rng.standard_normal(2)
         variance_ratio = self._variance_ratio  # variance of the film divided by the variance of the air
         correlation = math.sqrt(variance_ratio)
@@ -194,8 +198,8 @@ class Measurement:
         """
         if len(charge) == 0:
             return charge
-        time = (self._readings + np.arange(len(charge))) / self.rate
-        self._readings += len(charge)
+        time = (self._reading_count + np.arange(len(charge))) / self.rate  # since the first reading, s
+        self._reading_count += len(charge)
 
         # Charge of the film
         temperature = self._simulate_temperature(time)[:, np.newaxis]  # difference from the mean, shape (n, 1), K
@@ -217,7 +221,9 @@ class Measurement:
         """Simulate the temperature of the film relative to its mean.
 
         The temperature of the air drifts as a first-order autoregressive process, and changes by the temperature step.
-        The temperature of the film follows the temperature of the air as a first-order low-pass filter.
+        The temperature of the film follows the temperature of the air as a first-order low-pass filter with the time
+        constant `film_time`. The step starts at the time `step_at`, and the air has its initial temperature again after
+        the time `step_for`.
 
         Args:
             time: Times of the readings, shape (n,), s.
@@ -268,10 +274,11 @@ class Measurement:
         inputs = self.gain * changes + bias_charge
 
         # Each channel has its own time constant. The filter of a channel is output[n] = decay * output[n - 1] +
-        # inputs[n]. A charge that arrives between two readings has decayed by the factor (1 + decay) / 2 on average.
+        # inputs[n]. A charge that arrives just after a reading decays by the factor `decay` until the next reading, and
+        # a charge that arrives just before the next reading does not decay. The mean factor is about (1 + decay) / 2.
         decays = np.exp(-1.0 / (self.rate * self.leak_time))
         inputs *= 0.5 * (1.0 + decays)
-        channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)
+        channels = zip(decays.tolist(), inputs.T, self._output.tolist(), strict=True)  # the last is the previous output
         outputs = [_decaying_sum(decay, channel_inputs, previous) for decay, channel_inputs, previous in channels]
         output = np.stack(outputs, axis=1)
         self._output = output[-1]
@@ -388,7 +395,7 @@ def load_amplifier(level: StrPath) -> Amplifier:
         tau_s = 1.0          # inf for no leak
 
     Args:
-        level: Name of a noise level, or path of a TOML file.
+        level: Name of a noise level, or path of a TOML file that describes an amplifier.
 
     Returns:
         The amplifier. The noise of an amplifier from a file is named after the file.
@@ -405,6 +412,7 @@ def load_amplifier(level: StrPath) -> Amplifier:
     changes = {name: value for name, value in structs.asdict(file).items() if value is not None}
 
     # Remove the level and the parameters of the noise, because the remaining keys must be attributes of the amplifier.
+    # The key `like` is always present, because it has the default "clean".
     similar_amplifier = AMPLIFIER_LEVELS[changes.pop("like")]
     white = changes.pop("white_pC", similar_amplifier.noise.white)
     gain = changes.pop("proportional", similar_amplifier.noise.gain)

@@ -84,7 +84,8 @@ def design_command(
         result = design(case, executor=executor)
         write_design(result, output)
     results = result.to_dict()
-    del results["case"]
+    del results["case"]  # repeats the options of the command
     show_result(results)
+    # The charges of the layout are unambiguous if there are no folds and no pairs of contacts with the same charges.
     caution = "" if result.unambiguous else "caution: "
     say(f"{caution}{result.summary}; files in {output}")

@@ -50,6 +50,7 @@ def sweep_command(
     _, max_force = force
     warn_of_stress(film_sensor.film, probes, max_force)
     with shown_progress(), executor_for(workers, cluster) as executor:
+        # The option `radius` is a number of mm, or "auto" for the radius of the working area.
         largest_distance = sweep_radius(radius, film_sensor, probes, force, executor)
         sweep = Sweep(largest_distance, force, samples, seed, orientation)
         run_sweep(output, film_sensor, probes, sweep, executor=executor)
