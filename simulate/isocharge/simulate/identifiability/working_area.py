@@ -69,8 +69,8 @@ def find_folds(charge_map: ChargeMap, rings: Rings, force: float, noise: NoiseMo
         contact = contacts_at(position.reshape(-1, 2), force)
         return limits_at(charge_map, contact, noise).position.reshape(position.shape[:-1])
 
-    # The search for folds starts where the reciprocal of the error is small, because it is zero at a fold. The first
-    # step at each position is the distance of its farther neighbour on the rings, shape (n,), mm.
+    # The search for folds starts where the reciprocal of the error is small, because it is zero at a fold. The initial
+    # step of each position is the distance of its farther neighbour on the rings, shape (n,), mm.
     error_on_rings = position_error(onto_disk(rings.position, radius))
     position, step = _starting_points(rings, 1.0 / error_on_rings)
 
