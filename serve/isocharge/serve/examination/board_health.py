@@ -119,8 +119,8 @@ def _fit_drift_and_hum(
     phases = 2.0 * np.pi * np.outer(times_s, fitted_Hz)  # shape (n, frequencies)
     design_matrix = np.column_stack([np.ones_like(times_s), times_s, np.cos(phases), np.sin(phases)])
     coefficients = np.linalg.lstsq(design_matrix, charge_pC, rcond=None)[0]
-    _constant, drift_pC_per_s, *amplitudes = coefficients.tolist()
-    cosines, sines = np.reshape(amplitudes, (2, -1))  # each of shape (frequencies,)
+    _constant, drift_pC_per_s, *factors = coefficients.tolist()
+    cosines, sines = np.reshape(factors, (2, -1))  # factors of the cosines and of the sines, shape (frequencies,)
     hum_pC = dict(zip(fitted_Hz, np.hypot(cosines, sines).tolist(), strict=True))
     noise_pC = float((charge_pC - design_matrix @ coefficients).std())
     return drift_pC_per_s, (hum_pC.get(50.0), hum_pC.get(60.0)), noise_pC
@@ -143,8 +143,9 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
     unread_line = shown(capture.parser.unread_line) if capture.parser.unread_line else ""
 
     # State at most one of these faults: no bytes, no frames, or damaged frames.
-    advice = "check the cable, and whether the baud rate of the board is exact"
-    if not has_speed(received.url):
+    if has_speed(received.url):  # only a serial port has a baud rate
+        advice = "check the cable, and whether the baud rate of the board is exact"
+    else:
         advice = (
             "if a serial server uses the telnet protocol, which doubles each byte 0xFF, set the port of the server to "
             'raw TCP (also called "raw", "TCP server" or "TCP socket")'
@@ -161,12 +162,13 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
             "numbers; a line that begins with # is a comment"
         )
     elif not capture.frames:
-        yield (
+        yield (  # with the latest chunk of bytes as an example
             f"bytes were received, such as {shown(received.data[-1])}, but no frames were recognised: try another baud "
             "rate with --baud, end each line of text with a line feed, or describe the format in a device file "
             f"(--device); {advice}; a board without noise shows its channels only while the film is touched"
         )
-    elif capture.intact_share + 1.0 / len(capture.frames) < CLEAN_SHARE:  # without the first frame, often incomplete
+    # The bytes of one frame are added to the intact bytes, because the first frame is often incomplete.
+    elif capture.intact_share + 1.0 / len(capture.frames) < CLEAN_SHARE:
         damaged = f"{1.0 - capture.intact_share:.1%} of the bytes do not belong to good frames"
         if unread_line:
             damaged += (
@@ -175,7 +177,8 @@ def transmission_sentences(capture: Capture) -> Iterator[str]:
             )
         yield f"{damaged}: {advice}"
 
-    # Compare the clock of the board with the arrival times, unless the frames come from a file.
+    # Compare the clock of the board with the arrival times, unless the frames come from a file, whose bytes all arrive
+    # within less than `LIVE_TIME_s`.
     has_clock = capture.frames and all(frame.t_us is not None for frame in capture.frames)
     if has_clock and received.span_s > LIVE_TIME_s:
         clock_span_s = float(elapsed_times(capture.frames)[-1])
@@ -208,10 +211,15 @@ def channel_count_sentences(
         electrodes: Electrodes of the model; empty for any model.
     """
     try:
+        # Raise an error if the board lacks a channel that the device file names.
         if device.channels:
             Channels(Setup(tuple(device.channels), device)).channel_indices(capture.frames[-1])
-        if set(electrodes) <= set(device.channels):  # always true without a model, which means without electrodes
+        # Do not compare the channels with the model if the device file already assigns a channel to every electrode of
+        # the model. This is also the case without a model, because there are then no electrodes.
+        if set(electrodes) <= set(device.channels):
             return
+        # Raise an error if the names of the channels are nearly those of the electrodes. The error calls the model the
+        # `reader` of the channels. The units in the names are not checked here.
         Channels(Setup(electrodes, reader="the model"), any_unit=True).indices_by_name_or_order(capture.frames[-1])
     except ChargeError as error:
         yield str(error)
@@ -256,11 +264,11 @@ def channel_sentences(
         max_drift_pC_per_s: Largest harmless drift, pC/s.
         max_hum_pC: Largest harmless amplitude of hum, pC. The default is below the noise of the film.
     """
-    rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
+    tare_rule = device.rule(TareRule) or TareRule()  # the defaults if the device file has no tare
     hum_rule = device.rule(HumRule)
     removed_Hz = None if hum_rule is None else hum_rule.frequency_Hz  # frequency of the hum that the stream removes
     # A current of any size at rest is an offset.
-    offset_limit_pC = math.inf if device.has_currents else rule.offset_limit_pC
+    offset_limit_pC = math.inf if device.has_currents else tare_rule.offset_limit_pC
     for channel in channels:
         name = f"channel {printable(channel.name)}"
         if channel.unusable:
@@ -273,13 +281,13 @@ def channel_sentences(
                 f"{name} is dead: every value is {channel.offset_pC:g}; check the amplifier and the wire of this "
                 "channel, or send more digits"
             )
-        # Of a channel without a usable value, only the unusable values are reported.
+        # The limits below are in pC. Of a channel without a usable value, only the unusable values are reported.
         if unit != "pC" or channel.noise_pC is None or channel.offset_pC is None or channel.drift_pC_per_s is None:
             continue
-        if channel.noise_pC > rule.noise_limit_pC:
+        if channel.noise_pC > tare_rule.noise_limit_pC:
             yield (
                 f"{name} has a noise of {channel.noise_pC:.3g} pC rms, but a tare needs less than "
-                f"{rule.noise_limit_pC:g} pC"
+                f"{tare_rule.noise_limit_pC:g} pC"
             )
         if abs(channel.offset_pC) > offset_limit_pC:
             yield (
@@ -298,7 +306,7 @@ def channel_sentences(
 
 
 def held_press_sentences(capture: Capture, device: Device, held_press: HeldPress) -> Iterator[str]:
-    """Yield one sentence for each missing setting or property without which the force of a held press seems to change.
+    """Yield one sentence for each missing setting or property that keeps the computed force of a held press constant.
 
     The charge amplifiers leak: the charge of a held press decays with a time constant, which the section `[leak]` of
     the device file states. The program corrects the leak with the times of the frames. Two things may be missing:

@@ -86,14 +86,14 @@ def check_electrodes(
         PortLost: If the connection to the board is lost.
     """
     electrodes = list(channels)
-    names = list(channels.values())
+    channel_names = list(channels.values())
     ask("wait, and do not touch the film, until the rest level is known")
     frames = _charge_frames(port, device, channels, unit, rest_span)
     changes = np.array([_charges_of_press(frames, electrode, ask, timeout_s) for electrode in electrodes])
-    columns = assign_channels(changes, electrodes)
-    found = {electrode: names[column] for electrode, column in zip(electrodes, columns, strict=True)}
+    columns = assign_channels(changes, electrodes)  # for each electrode: index in `channel_names`
+    found = {electrode: channel_names[column] for electrode, column in zip(electrodes, columns, strict=True)}
     # A channel is inverted if its value falls under the press near its own electrode.
-    inverted = tuple(names[column] for row, column in enumerate(columns) if changes[row, column] < 0.0)
+    inverted = tuple(channel_names[column] for row, column in enumerate(columns) if changes[row, column] < 0.0)
     return ElectrodeCheck(dict(channels), found, inverted)
 
 
@@ -148,16 +148,20 @@ def corrected_table(table: Mapping[str, Any], check: ElectrodeCheck) -> dict[str
         table: Content of the device file with the assumed channels.
         check: Result of the presses.
     """
-    # Each electrode receives the settings of the electrode to which its channel was assumed to belong.
+    # Each electrode receives the settings of its source, the electrode to which its channel was assumed to belong.
     expected_electrode = {channel: electrode for electrode, channel in check.expected.items()}
-    source_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
+    source_of_electrode = {electrode: expected_electrode[channel] for electrode, channel in check.found.items()}
 
     def moved(setting: Any) -> Any:
-        """Return a setting, section or table, with the values of single electrodes moved to other electrodes."""
+        """Return a setting, section or table, with the values of single electrodes moved to other electrodes.
+
+        The new value of each electrode is the old value of its source. The presses have shown that the channel of the
+        electrode had been assumed to belong to this source, and the values belong to the channels.
+        """
         if not isinstance(setting, Mapping):
             return setting
-        if set(setting) == set(source_electrode):
-            return {electrode: setting[source] for electrode, source in source_electrode.items()}
+        if set(setting) == set(source_of_electrode):  # the setting has one value for each electrode
+            return {electrode: setting[source] for electrode, source in source_of_electrode.items()}
         return {name: moved(value) for name, value in setting.items()}
 
     return {**moved(table), "channels": dict(check.found)}
@@ -168,8 +172,8 @@ def _charge_frames(
 ) -> Iterator[Frame]:
     """Yield the frames of a board with their touch charges in the order of the electrodes.
 
-    If the gain is unknown, the charges have the unit of the board. The tare therefore accepts any offset, and the
-    charges of a touch may have any sign.
+    If the gain is unknown, the charges have the unit of the board. The tare therefore always accepts any offset, and
+    the charges of a touch may have any sign.
 
     Args:
         port: The open port.
@@ -177,17 +181,20 @@ def _charge_frames(
         channels: Channel of each electrode, by the name of the electrode.
         unit: Unit of the charges. The default threshold of a touch is for pC and counts. In another unit, the threshold
             depends only on the noise.
-        rest_span: Largest minus smallest charge of a channel at rest, which limits the noise that a tare accepts.
+        rest_span: Largest minus smallest charge of a channel at rest. A tare is measured only from frames whose
+            standard deviation is not larger, so that the noise of an untouched film is accepted.
     """
     rules: dict[type[Rule], Rule] = {
+        # The stream waits without a time limit for the first frames that are quiet enough (`patience=0`).
         TareRule: TareRule(noise_limit_pC=rest_span, offset_limit_pC=math.inf, patience=0),
         TouchRule: TouchRule() if unit in ("pC", "counts") else TouchRule(floor_pC=0.0),
     }
     gain = device.rule(GainRule)
     if gain is not None:
         rules[GainRule] = gain
-    raw_device = structs.replace(device, channels=dict(channels), rules=rules)
-    stream = ReadingStream(tuple(channels), raw_device, has_any_sign=True)
+    # The stream uses only these rules, so no other section of the device file, such as [leak], changes the charges.
+    device_with_few_rules = structs.replace(device, channels=dict(channels), rules=rules)
+    stream = ReadingStream(tuple(channels), device_with_few_rules, has_any_sign=True)
     for chunk in port:
         yield from stream.frames(chunk)
 
@@ -224,7 +231,7 @@ def _charges_of_press(frames: Iterator[Frame], electrode: str, ask: Callable[[st
             charges.append(frame.charge_pC)
         elif charges and frame.clock_s - begin_s >= PressWatch.MIN_HELD_S:  # the press has ended
             return np.asarray(np.mean(charges, axis=0))
-        else:  # there was no touch, or only a short one, as damaged frames cause it
+        else:  # there was no touch, or only a short one, which damaged frames can cause
             charges = []
     raise PressCheckError(
         f"electrode {electrode}: no press began and ended within {timeout_s:g} s; take the finger away after each "

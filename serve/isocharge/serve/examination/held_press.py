@@ -50,11 +50,12 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress:
         times_s: Times since the first frame, shape (n,), s.
 
     Returns:
-        The press; the default values if no such press is found.
+        The press; an empty `HeldPress()`, whose description is empty, if no such press is found.
     """
-    # Find the first touch. An element behind the last block makes the search end there if no block is touched, or if
-    # the film is touched until the end.
-    block_times_s, levels, is_touched = touched_blocks(values, times_s)
+    # Find the first touch. A block is an interval of 0.1 s, and its levels are the medians of the channels in it. An
+    # element behind the last block makes the search end there if no block is touched, or if the film is touched until
+    # the end.
+    block_times_s, block_levels, is_touched = touched_blocks(values, times_s)
     begin = int(np.argmax([*is_touched, True]))  # first block of the touch
     end = begin + int(np.argmin([*is_touched[begin:], False]))  # first block after the touch
 
@@ -70,18 +71,18 @@ def find_held_press(values: Array, times_s: Array) -> HeldPress:
         return HeldPress()
 
     # Reduce the levels of all channels to one charge, which is their component along the change that the press causes.
-    # It has the value 1 at the beginning of the press.
-    step = levels[held][0] - levels[rest][-1]
-    projected_levels = levels @ step / (step @ step)  # shape (blocks,)
+    # It has the value 1 at the beginning of the press. The blocks of rest ensure that block `begin - 1` exists.
+    press_change = block_levels[held][0] - block_levels[rest][-1]
+    projected_levels = block_levels @ press_change / (press_change @ press_change)  # shape (blocks,)
     charge = projected_levels[held] - projected_levels[rest].mean()
     drift_per_s, _ = _fit_line(rest_times_s, projected_levels[rest])
     begin_s = (block_times_s[begin - 1] + block_times_s[begin]) / 2.0
-    tau_s, description = _describe(held_times_s - begin_s, charge, drift_per_s)
+    tau_s, description = _describe_change(held_times_s - begin_s, charge, drift_per_s)
     rest_end_s = float(rest_times_s[-1] + block_times_s[begin - 1]) / 2.0
     return HeldPress(rest_end_s, tau_s, description)
 
 
-def _describe(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[float | None, str]:
+def _describe_change(held_times_s: Reals, charge: Reals, drift_per_s: float) -> tuple[float | None, str]:
     """Describe how the charge of a press changes: whether it is constant, drifts, leaks or creeps.
 
     Args:
@@ -122,7 +123,7 @@ def _cause_of_change(held_s: Reals, charge: Reals, min_residual_ratio: float = 9
     """
     # A leak makes the charge decay exponentially with time. Creep makes the charge decay as a power of time.
     leak_slope_per_s, leak_residual = _fit_line(held_s, np.log(charge))
-    creep_slope, creep_residual = _fit_line(np.log(held_s), np.log(charge))
+    creep_slope, creep_residual = _fit_line(np.log(held_s), np.log(charge))  # the slope is the exponent of the power
     if leak_slope_per_s < 0.0 and creep_residual > min_residual_ratio * leak_residual:
         tau_s = float(f"{-1.0 / leak_slope_per_s:.2g}")
         return tau_s, f"the amplifier leaks: put [leak] tau_s = {tau_s:g} into a device file"

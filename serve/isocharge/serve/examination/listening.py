@@ -62,11 +62,11 @@ class ReceivedData:
         chunks span n intervals. With fewer than two chunks, the result is the time of listening. The result is never
         0, so that a rate computed from it is finite.
         """
-        span_s = self.seconds
+        duration_s = self.seconds  # time of listening
         if len(self.chunks) > 1:
             first_to_last_s = elapsed_s(self.chunks[0], self.chunks[-1])
-            span_s = first_to_last_s * len(self.chunks) / (len(self.chunks) - 1)
-        return max(span_s, np.finfo(float).eps)
+            duration_s = first_to_last_s * len(self.chunks) / (len(self.chunks) - 1)
+        return max(duration_s, np.finfo(float).eps)
 
     @property
     def are_datagrams(self) -> bool:
@@ -89,17 +89,20 @@ def listen(
     itself and is silent at one baud rate is silent at every baud rate, so further attempts would be useless. A board
     that needs requests does not understand them at a wrong baud rate.
 
+    The bytes of the attempts are dropped. After the attempts, the function listens again, for `seconds`.
+
     Args:
         url: The port.
         bauds: Baud rates to try, bit/s.
         seconds: Time of listening at the right baud rate, s.
         request: Request that the board needs; None if the board sends frames by itself.
         has_frames: Function that returns whether most of the bytes are frames.
-        wait: Time to wait until the port can be opened, s.
+        wait: Longest time until the port can be opened, s.
         try_s: Time of listening at a baud rate before the next one is tried, s.
 
     Returns:
-        The bytes at the chosen baud rate, which is the first of `bauds` if no baud rate is suitable.
+        The bytes at the chosen baud rate, which is the first of `bauds` if no baud rate is suitable. If the board is
+        silent, the result of the first attempt, without bytes.
 
     Raises:
         PortError: If the port cannot be opened.
@@ -109,7 +112,7 @@ def listen(
     if has_speed(url) and len(bauds) > 1:
         for baud in bauds:
             received = _listen_at_baud(url, baud, try_s, request, wait)
-            if not (received.chunks or request):
+            if not (received.chunks or request):  # the board is silent at every baud rate
                 return received
             if has_frames(received):
                 chosen_baud = baud
@@ -133,7 +136,7 @@ def _listen_at_baud(url: str, baud: int, seconds: float, request: Request | None
     with Port(url, baud=baud, request=request, wait=wait) as port, suppress(PortLost):
         start_s = time.monotonic()
         chunk = port.read(port.start_up_s)
-        if chunk is not None:
+        if chunk is not None:  # the time of listening begins at the first byte
             start_s = time.monotonic()
         while chunk is not None:
             received.chunks.append(chunk)
@@ -207,6 +210,8 @@ def elapsed_times(frames: Sequence[Frame]) -> Array:
 def read_frames(received: ReceivedData, device: Device) -> Capture:
     """Find the frames in the bytes that were received from a port, and determine their times.
 
+    The parser of the result has also counted the lost and repeated frames.
+
     Args:
         received: The bytes.
         device: Settings of the board, which define the format.
@@ -219,8 +224,8 @@ def read_frames(received: ReceivedData, device: Device) -> Capture:
     all_frames: list[Frame] = []
     for chunk in received.chunks:
         frames = [frame for frame in parser.feed(chunk.data) if frame.values]  # not those with only a clock or counter
-        clock.stamp(chunk, frames, parser.t_us_modulus)
+        clock.stamp(chunk, frames, parser.t_us_modulus)  # writes the times into the frames
         all_frames += frames
-        for frame in frames:
+        for frame in frames:  # counts lost and repeated frames in `parser.counts`; the returned flags are not used
             parser.sequence_flags(frame.seq)
     return Capture(received, parser, all_frames)

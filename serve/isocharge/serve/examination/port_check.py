@@ -118,14 +118,14 @@ def examine(
 
     def has_frames(received_at_baud: ReceivedData) -> bool:
         """Return whether most of the bytes belong to intact frames, which shows that the baud rate is right."""
-        board = _board(received_at_baud, device)
-        return read_frames(received_at_baud, board).intact_share >= INTACT_SHARE
+        settings = _settings_of(received_at_baud, device)
+        return read_frames(received_at_baud, settings).intact_share >= INTACT_SHARE
 
     received = listen(url, bauds, seconds, request or device.request, has_frames, wait)
     return examine_received(received, device=device, electrodes=electrodes, gain=gain)
 
 
-def _board(received: ReceivedData, device: Device) -> Device:
+def _settings_of(received: ReceivedData, device: Device) -> Device:
     """Return the settings of the board. For `ANY_BOARD`, the format of the frames is recognised from the bytes."""
     if device is not ANY_BOARD:
         return device
@@ -157,7 +157,7 @@ def examine_received(
     """
     # Without a device file (`ANY_BOARD`), the format of the frames and the settings are proposed from the bytes.
     is_proposed = device is ANY_BOARD
-    device = _board(received, device)
+    device = _settings_of(received, device)
     capture = read_frames(received, device)
     missing = list(transmission_sentences(capture))
     counts = capture.parser.counts
@@ -257,18 +257,18 @@ def electrodes_by_position(capture: Capture, device: Device, electrodes: tuple[s
     # Without a model, use the names in the section [gain]. Each of its settings is one number for all electrodes, or a
     # dictionary with a number for each electrode.
     names = electrodes
-    rule = device.rule(GainRule)
-    if rule is not None and not names:
-        dictionaries = [setting for setting in (rule.offset, rule.pC_per_unit) if isinstance(setting, dict)]
-        names = tuple(dictionaries[0]) if dictionaries else ()
+    gain_rule = device.rule(GainRule)  # the section [gain]
+    if gain_rule is not None and not names:
+        by_electrode = [setting for setting in (gain_rule.offset, gain_rule.pC_per_unit) if isinstance(setting, dict)]
+        names = tuple(by_electrode[0]) if by_electrode else ()
 
-    # Find the channels by name or by order. There is no result if no names are known, if there are more or fewer
-    # channels than names, or if the names of the channels are not clear.
+    # Find the channels by name or by order, whatever unit their names state. There is no result if no names are known,
+    # if there are more or fewer channels than names, or if the names of the channels are not clear.
     with suppress(ChargeError):  # a stream reports this error when it begins
         positions = Channels(Setup(names), any_unit=True).indices_by_name_or_order(last_frame)
         if positions:
             return dict(zip(positions, names, strict=True))
-    return dict(enumerate(capture.names))
+    return dict(enumerate(capture.names))  # no electrodes are known, so each channel counts as one
 
 
 def port_lines() -> Iterator[str]:
@@ -282,9 +282,9 @@ def port_lines() -> Iterator[str]:
     for port in sorted(list_ports.comports()):
         try:
             examination = examine(port.device, seconds=1.0)
-            received = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
+            result = f"{examination.format}, {examination.rate_Hz:.0f} frames/s at {examination.baud} baud"
             if not examination.good:
-                received = examination.missing[0]
+                result = examination.missing[0]  # a sentence
         except IsochargeError as error:
-            received = str(error)
-        yield f"{port.device} ({port.description}): {received}"
+            result = str(error)
+        yield f"{port.device} ({port.description}): {result}"

@@ -72,10 +72,10 @@ def _detect_touches(levels: Array, noise: Array) -> Booleans:
     is_touched = np.zeros(len(levels), dtype=bool)
     for number, level in enumerate(levels):
         was_touched = number > 0 and is_touched[number - 1]
-        if not was_touched:
+        if not was_touched:  # always true for the first block
             rest_level = levels[max(number - CHANGE_BLOCKS, 0)]
         frame = Frame(seq=None, t_us=None, values=(), dt_s=BLOCK_S, charge_pC=level - rest_level)
-        frame.noise_pC = noise
+        frame.noise_pC = noise  # cannot be passed to the constructor
         detector.step(frame)
         is_touched[number] = frame.is_contact
     return is_touched
@@ -92,8 +92,8 @@ def touch_sentence(names: Sequence[str], values: Array, times_s: Array, unit: st
         values: Values of the channels, shape (n, channels).
         times_s: Times since the first frame, shape (n,), s.
         unit: Unit of the values.
-        min_noise_pC: Smallest noise of a channel in pC. With the default, the smallest touch is 20 pC. A press of 0.01
-            N on a film of 25 um causes 40 pC.
+        min_noise_pC: Smallest noise of a channel in pC. A touch exceeds about 20 standard deviations of the noise. With
+            the default, the smallest touch is therefore 20 pC. A press of 0.01 N on a film of 25 um causes 40 pC.
     """
     min_noise = min_noise_pC if unit == "pC" else 0.0
     block_times_s, levels, is_touched = touched_blocks(values, times_s, min_noise)
@@ -101,7 +101,7 @@ def touch_sentence(names: Sequence[str], values: Array, times_s: Array, unit: st
         return ""
     changes = np.ptp(levels, axis=0)
     name = printable(names[int(np.argmax(changes))])
-    begin_s = block_times_s[np.argmax(is_touched)]
+    begin_s = block_times_s[np.argmax(is_touched)]  # time of the first touched block
     return (
         f"an untouched film: channel {name} changes by {changes.max():.4g} {unit} about {begin_s:.1f} s after the "
         "first frame, as under a touch; take the finger away, and try again"
@@ -125,7 +125,7 @@ def block_medians(values: Array, times_s: Array) -> Array:
     *complete_blocks, _last_block = np.split(finite_values, first_rows)
     with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of a block without finite values
         medians = [np.nanmedian(block, axis=0) for block in complete_blocks]
-    return np.reshape(medians, (-1, values.shape[1]))  # also without a block
+    return np.reshape(medians, (-1, values.shape[1]))  # has one column for each channel even if there is no block
 
 
 def estimate_noise(values: Array) -> Array:

@@ -47,23 +47,23 @@ def propose(
     Args:
         capture: Frames that the board sent, at least one.
         rest_values: Values of all channels while the film is at rest, shape (n, channels).
-        frames: Section `[frames]`.
+        frames: Section `[frames]` of the device file, which describes the format of the frames.
         electrodes: Electrodes of the model. Without a model, each channel whose values vary is an electrode.
         gain: Gain as the user states it, such as `pC_per_unit`; empty if it is unknown.
     """
     table: dict[str, Any] = {"name": "board", "frames": frames}
     values, _times_s = capture.values()
-    positions = _choose_channels(capture, values, electrodes)
-    if positions:  # otherwise it is not clear which channels belong to the electrodes
-        table["channels"] = {electrode: capture.names[position] for electrode, position in positions.items()}
-    offset = {electrode: _rest_level(rest_values[:, position]) for electrode, position in positions.items()}
+    channel_positions = _choose_channels(capture, values, electrodes)  # for each electrode: index of its channel
+    if channel_positions:  # otherwise it is not clear which channels belong to the electrodes
+        table["channels"] = {electrode: capture.names[position] for electrode, position in channel_positions.items()}
+    offset = {electrode: _rest_level(rest_values[:, position]) for electrode, position in channel_positions.items()}
     has_large_offset = any(abs(level) > TareRule().offset_limit_pC for level in offset.values())
-    is_in_pC = unit_of(capture, positions.values()) == "pC"
+    is_in_pC = unit_of(capture, channel_positions.values()) == "pC"
     if gain or has_large_offset or not is_in_pC:
         table["gain"] = {"offset": offset} if any(offset.values()) else {}
         if gain:
             table["gain"] |= gain
-        elif is_in_pC:
+        elif is_in_pC:  # in another unit, the user has to state `pC_per_unit`
             table["gain"]["pC_per_unit"] = 1.0
     return table
 
@@ -94,7 +94,7 @@ def unit_of(capture: Capture, positions: Iterable[int], max_noise_V: float = 0.0
         return units.pop()
     if units or capture.parser.format == BINARY_FORMAT:
         return "pC"
-    values = capture.values()[0][:, channels]  # shape (frames, channels)
+    values = capture.values()[0][:, channels]  # the values without their times, shape (frames, channels)
     finite_values = values[np.isfinite(values)]
     if finite_values.size and (finite_values == np.round(finite_values)).all():
         return "counts"
