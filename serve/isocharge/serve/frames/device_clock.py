@@ -85,21 +85,21 @@ class DeviceClock:
     def reset(self) -> None:
         """Treat the next reading as the first reading of a new connection.
 
-        The fit is a straight line that converts the clock of the device to the time of the host. The fit begins with
-        the first reading.
+        The fit is a straight line that converts the clock of the device to the time of the host. The slope of the line
+        is `rate`. The fit begins with the first reading.
         """
         self._device_us = 0  # clock of the latest reading after the wraps were removed
-        self._latest_arrival_s: float | None = None  # arrival of the latest chunk whose bytes were read at once
+        self._latest_arrival_s: float | None = None  # arrival of the latest chunk that did not wait to be read
         self._is_new_arrival = False  # whether the present chunk arrived at another time than that chunk
 
-        self._has_fit = False
-        # According to the fit, the host time was `_fitted_host_s` when the clock of the device was `_fitted_us`.
-        self._fitted_us = 0
-        self._fitted_host_s = 0.0
+        self._has_fit = False  # whether a reading with a clock has arrived
+        # The line passes through this point: the host time was `_anchor_host_s` when the device clock was `_anchor_us`.
+        self._anchor_us = 0
+        self._anchor_host_s = 0.0
         self._fit_age_s = 0.0  # time since the beginning of the fit
         self._is_fit_provisional = True  # whether the fit relies on the arrival of only one chunk
-        self._predicted_s = 0.0  # host time of the latest reading according to the fit
-        self._latest_host_s = -math.inf  # host time of the latest reading, which does not decrease
+        self._predicted_host_s = 0.0  # host time of the latest reading according to the line
+        self._latest_host_s = -math.inf  # host time in the latest frame; does not decrease if the line is corrected
 
     def stamp(self, chunk: Chunk, frames: Sequence[Frame], modulus: int) -> None:
         """Write the times at which the frames of a chunk were taken into the frames, and adjust the clock to the chunk.
@@ -107,7 +107,7 @@ class DeviceClock:
         Args:
             chunk: The bytes that contain the ends of the frames.
             frames: The frames, which are changed in place.
-            modulus: Time at which the clock wraps to 0, us.
+            modulus: Time at which the clock of the device wraps to 0, us.
         """
         if not frames:  # the time since the previous frames is divided when the next frame has ended
             return
@@ -115,12 +115,14 @@ class DeviceClock:
         self._latest_chunk = chunk
         interval_s = elapsed_s(previous_chunk, chunk)
 
-        # The clock is fitted only to arrival times that differ from the previous one, because all chunks of a file have
-        # the same arrival time. It is not fitted to the first arrival, after which the chunks may be those of a file.
+        # All chunks of a file have the same arrival time, to which the clock must not be fitted. The arrival time of a
+        # chunk is therefore new only if there was an earlier chunk, and if this chunk had another arrival time.
         self._is_new_arrival = self._latest_arrival_s not in (None, chunk.timestamp)
 
+        # If the first frame has no clock, the times of all frames are estimated. Later frames of the chunk may have a
+        # clock, because a header between lines of text can name it.
         if frames[0].t_us is None:
-            self._divide_interval(interval_s, chunk.timestamp, frames)
+            self._estimate_times(interval_s, chunk.timestamp, frames)
         for frame in frames:
             if frame.t_us is not None:
                 self._stamp_with_device(frame, frame.t_us, modulus, chunk.timestamp)
@@ -130,16 +132,19 @@ class DeviceClock:
         is_read_at_once = len(chunk.data) < MAX_READ_BYTES
         if is_read_at_once:
             self._latest_arrival_s = chunk.timestamp
-            if self._is_new_arrival and self._has_fit:
+            if self._is_new_arrival and self._has_fit:  # without a clock of the device, there is no fit
                 self._fit_arrival(chunk.timestamp)
 
-    def _divide_interval(self, interval_s: float, arrival_s: float, frames: Sequence[Frame]) -> None:
+    def _estimate_times(self, interval_s: float, arrival_s: float, frames: Sequence[Frame]) -> None:
         """Write times into the frames of a chunk. The times of frames with a clock are replaced afterwards.
 
-        The time since the previous chunk is divided evenly among the frames of the chunk, and the last frame has the
-        arrival time of the chunk. The time since the previous chunk is unknown for the first chunk of a connection and
-        for all chunks of a file, which arrive at the same time. All frames of such a chunk have the same `host_s`. For
-        `dt_s` and `clock_s`, the interval between two frames of such a chunk is assumed to be `FILE_INTERVAL_s`.
+        Each frame gets its unix time `host_s`, the time `dt_s` since the previous frame, and a time `clock_s` that does
+        not jump when the wall clock is set. There are two cases:
+
+        - The time since the previous chunk is divided evenly among the frames, and the last frame has the arrival time.
+        - The time since the previous chunk is unknown (0) for the first chunk of a connection, and for all chunks of a
+          file, which arrive at the same time. All frames of such a chunk have the same `host_s`. For `dt_s` and
+          `clock_s`, the interval between two frames is assumed to be `FILE_INTERVAL_s`.
 
         Args:
             interval_s: Time since the previous chunk, s; 0 if it is unknown.
@@ -151,18 +156,19 @@ class DeviceClock:
         else:
             self._monotonic_s += interval_s or len(frames) * self.FILE_INTERVAL_s
         # After a reset, the interval contains the outage of the port, and is not divided among the frames.
-        share_s = 0.0 if self._latest_arrival_s is None else interval_s / len(frames)
+        frame_interval_s = 0.0 if self._latest_arrival_s is None else interval_s / len(frames)  # 0 if it is unknown
         for later_count, frame in enumerate(reversed(frames)):  # number of frames after the frame in the chunk
-            frame.host_s = arrival_s - later_count * share_s
-            frame.dt_s = share_s or self.FILE_INTERVAL_s
+            frame.host_s = arrival_s - later_count * frame_interval_s
+            frame.dt_s = frame_interval_s or self.FILE_INTERVAL_s
             frame.clock_s = self._monotonic_s - later_count * frame.dt_s
 
     def _stamp_with_device(self, frame: Frame, t_us: int, modulus: int, arrival_s: float) -> None:
         """Compute the time of a frame from the clock of the device, and write it into the frame.
 
-        A straight line converts the clock to the time of the host (`_predicted_s`). The line was fitted to the arrivals
-        of earlier readings. A new fit begins if there is no fit yet, if the device has restarted, or if the predicted
-        time is far after the arrival.
+        A straight line, which was fitted to the arrivals of earlier readings, converts the clock without its wraps
+        (`_device_us`) to the time of the host (`_predicted_host_s`). A new fit begins if there is no fit yet, if the
+        device has restarted, if the clock without its wraps would be below 0, or if the predicted time is far after the
+        arrival.
 
         The clock may be lower than at the previous reading for three reasons. The size of the decrease shows the
         reason:
@@ -192,27 +198,27 @@ class DeviceClock:
             self._begin_fit(t_us, arrival_s)
         else:
             self._device_us += step_us
-        step_us = max(0, step_us)
-        self._predicted_s = self._fitted_host_s + self.rate * (self._device_us - self._fitted_us) * 1e-6
+        elapsed_us = max(0, step_us)
+        self._predicted_host_s = self._anchor_host_s + self.rate * (self._device_us - self._anchor_us) * 1e-6
 
-        if self._is_predicted_after(arrival_s):
+        if self._is_prediction_too_late(arrival_s):
             # If the clock is smaller than its step, it has passed 0 since the previous reading, which was taken for a
             # wrap. Because the prediction is wrong, the device has restarted instead.
-            has_restarted = t_us < step_us
+            has_restarted = t_us < elapsed_us
             if has_restarted:
                 frame.is_clock_reset = True
                 self._device_us = t_us
-                step_us = 0
+                elapsed_us = 0
             self._begin_fit(self._device_us, arrival_s)
 
         # The host time must not decrease, even if a correction of the fit has moved the predicted host time back.
-        self._latest_host_s = max(self._latest_host_s, self._predicted_s)
+        self._latest_host_s = max(self._latest_host_s, self._predicted_host_s)
         frame.host_s = self._latest_host_s
         frame.device_us = self._device_us
-        frame.dt_s = step_us * 1e-6
+        frame.dt_s = elapsed_us * 1e-6
         frame.clock_s = self._device_us * 1e-6
 
-    def _is_predicted_after(self, arrival_s: float) -> bool:
+    def _is_prediction_too_late(self, arrival_s: float) -> bool:
         """Return whether the predicted time of a reading is much later than its arrival, so that the fit is wrong.
 
         A reading is taken before it arrives. The fit is wrong if the clock of the host or of the device was set. The
@@ -224,58 +230,63 @@ class DeviceClock:
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         is_examined = self._is_new_arrival and not self._is_fit_provisional
-        return is_examined and self._predicted_s - arrival_s > MAX_LEAD_s
+        return is_examined and self._predicted_host_s - arrival_s > MAX_LEAD_s
 
     def _begin_fit(self, device_us: int, arrival_s: float) -> None:
-        """Begin a provisional fit with the present reading.
+        """Begin the line that converts the clock of the device to the time of the host, with the present reading.
 
-        The host time of the reading is its arrival time, or the host time of the previous reading if that is later.
+        The host time of the reading is its arrival time, or the host time of the previous reading if that is later. The
+        fit is provisional until `_fit_arrival` replaces it, because the first reading of a chunk may have been taken
+        some time before the chunk arrived.
 
         Args:
-            device_us: Clock of the reading, us.
+            device_us: Clock of the device at the reading, us.
             arrival_s: Arrival of the chunk that contains the reading, unix seconds.
         """
         self._device_us = device_us
-        self._fitted_us = device_us
-        self._fitted_host_s = max(arrival_s, self._latest_host_s)
-        self._predicted_s = self._fitted_host_s
+        self._anchor_us = device_us
+        self._anchor_host_s = max(arrival_s, self._latest_host_s)
+        self._predicted_host_s = self._anchor_host_s
         self._has_fit = True
         self._is_fit_provisional = True
 
     def _fit_arrival(self, arrival_s: float) -> None:
         """Fit the clock of the device to the arrival time of a chunk after its readings have been processed.
 
-        The fit is a straight line: the host time is `_fitted_host_s` when the clock of the device is `_fitted_us`, and
-        then advances by `rate` seconds per second of the device. The time that the line predicts for the latest reading
-        is `_predicted_s`.
+        The fit is a straight line: the host time is `_anchor_host_s` when the clock of the device is `_anchor_us`, and
+        then advances by `rate` seconds per second of the device. The latest reading has the clock `_device_us`, for
+        which the line predicts the host time `_predicted_host_s`.
 
         The fit is corrected with one step of a second-order delay-locked loop (Adriaensen 2005). Two numbers determine
-        the correction: the time step_s since the previous correction, and the difference delay_s between the arrival
-        time and the predicted time. The gain of the loop is w = 2 pi * bandwidth * step_s, but at most `MAX_LOOP_GAIN`,
-        because a larger gain would make the loop unstable. The correction adds sqrt(2) w delay_s to the predicted host
-        time, and w^2 delay_s / step_s to the rate of the clock. The bandwidth decreases with the age of the fit.
+        the correction: the time since_fit_s since the previous correction, and the difference delay_s between the
+        arrival time and the predicted time. The gain of the loop is w = 2 pi * bandwidth * since_fit_s, but at most
+        `MAX_LOOP_GAIN`, because a larger gain would make the loop unstable. The correction adds sqrt(2) w delay_s to
+        the predicted host time, and w^2 delay_s / since_fit_s to the rate of the clock. The bandwidth decreases with
+        the age of the fit.
 
         Args:
             arrival_s: Arrival of the chunk, unix seconds.
         """
-        delay_s = arrival_s - self._predicted_s  # positive if the chunk arrived later than predicted
-        step_s = (self._device_us - self._fitted_us) * 1e-6  # since the previous correction of the fit
-        self._fitted_us = self._device_us
         # If a board sends readings that it stored before the connection, their clock advances faster than time passes,
-        # and moves the host time far ahead of the arrivals. The lead is therefore limited.
+        # and moves the host time of the latest reading far ahead of the arrivals. The lead is therefore limited.
         self._latest_host_s = min(self._latest_host_s, arrival_s + MAX_LEAD_s)
+
+        delay_s = arrival_s - self._predicted_host_s  # positive if the chunk arrived later than predicted
+        since_fit_s = (self._device_us - self._anchor_us) * 1e-6  # since the previous correction of the fit
+        self._anchor_us = self._device_us
 
         # A provisional fit relies on the arrival of only one chunk. A fit that begins at this arrival replaces it.
         if abs(delay_s) > MAX_DELAY_s or self._is_fit_provisional:
-            self._fitted_host_s = arrival_s
+            self._anchor_host_s = arrival_s
             self._fit_age_s = 0.0
             self.rate = 1.0
             self._is_fit_provisional = False
             return
 
-        self._fit_age_s += step_s
+        self._fit_age_s += since_fit_s
+        # The bandwidth begins with `FIRST_BANDWIDTH_Hz`, is half of it after 1 s, and falls to `BANDWIDTH_Hz`.
         bandwidth_Hz = max(BANDWIDTH_Hz, FIRST_BANDWIDTH_Hz / (1.0 + self._fit_age_s))
-        loop_gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * step_s)
-        self._fitted_host_s = self._predicted_s + math.sqrt(2.0) * loop_gain * delay_s
-        if step_s > 0.0:  # otherwise, the rate is not corrected
-            self.rate += loop_gain**2 * delay_s / step_s
+        loop_gain = min(MAX_LOOP_GAIN, 2.0 * math.pi * bandwidth_Hz * since_fit_s)
+        self._anchor_host_s = self._predicted_host_s + math.sqrt(2.0) * loop_gain * delay_s
+        if since_fit_s > 0.0:  # otherwise, the rate is not corrected
+            self.rate += loop_gain**2 * delay_s / since_fit_s
