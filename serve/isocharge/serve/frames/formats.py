@@ -109,8 +109,9 @@ class AutoParser(Parser):
         """Return the frames whose last byte is in `data`.
 
         Until the format is recognised, the data are passed to the parsers of all formats. The first parser that finds a
-        frame receives all further data. With each frame, the description of the format and the moduli of the counter
-        and the clock are copied from this parser, because it may determine them only after many frames.
+        frame receives all further data. This parser may determine the description of its format, and the values at
+        which the counter and the clock wrap to 0 (the moduli), only after many frames. They are therefore copied from
+        the parser with each frame.
         """
         for parser in self._parsers:
             frames = parser.feed(data)
@@ -122,7 +123,7 @@ class AutoParser(Parser):
                 self.seq_modulus = parser.seq_modulus
                 self.t_us_modulus = parser.t_us_modulus
                 return frames
-            self.unread_line = parser.unread_line or self.unread_line
+            self.unread_line = parser.unread_line or self.unread_line  # for messages to the user
         if self.recognised is None:  # a recognised parser counts its bytes itself
             self.counts.bytes_dropped += len(data)
         return []

@@ -243,7 +243,7 @@ class Columns:
             if names[column] not in (SEQ, *TIMES_US) and column != flags_column
         ]
         channel_names = tuple(names[column] for column, _ in self.channels)
-        self.names = channel_names if any(channel_names) else ()
+        self.names = channel_names if any(channel_names) else ()  # empty if no channel has a name
 
     def frame(self, numbers: Sequence[Any]) -> Frame:
         """Convert a row of numbers to a frame.
@@ -281,17 +281,17 @@ class Parser(ABC):
     """
 
     def __init__(self, format: str) -> None:
-        """Begin without stored bytes.
+        """Set the counters to 0, and begin without bytes of an unfinished frame.
 
         Args:
             format: Description of the format, for the user.
         """
         self.format = format
-        self.seq_modulus = SEQ_MODULUS
-        self.t_us_modulus = T_US_MODULUS
+        self.seq_modulus = SEQ_MODULUS  # value at which the frame counter of the board wraps to 0
+        self.t_us_modulus = T_US_MODULUS  # time at which the clock of the board wraps to 0, us
         self.counts = FrameCounts()
-        self.recognised: Parser | None = None
-        self.unread_line = ""
+        self.recognised: Parser | None = None  # parser of the format that this parser has recognised
+        self.unread_line = ""  # latest line of text that is no frame, for messages to the user
         self._tail = b""  # bytes of an unfinished frame
         self._previous_seq: int | None = None  # counter of the latest frame of the connection
 
@@ -338,12 +338,12 @@ class Parser(ABC):
         if increase == 0:
             self.counts.repeated += 1
             return (REPEAT,)
-        # An increase below `gap_limit` means that frames were lost. If the counter is lower than before, it may have
-        # wrapped. A large increase across the end of its range is more probably a restart, so the limit is then lower.
-        # If the clock was reset at the same time, or if the counter had exceeded the modulus, the counter has not
-        # wrapped, and no increase counts as a gap.
+        # An increase below `gap_limit` means that frames were lost.
         gap_limit = self.seq_modulus // 2
-        if seq < previous_seq:
+        if seq < previous_seq:  # the counter has wrapped, the device has restarted, or the frame is late
+            # The counter has not wrapped if the clock was reset at the same time. It has not wrapped either if it had
+            # reached `seq_modulus`, because the modulus is then wrong. In both cases, no increase counts as a gap. In
+            # all other cases, a large increase across the end of the range is more probably a restart than a gap.
             cannot_wrap = is_clock_reset or previous_seq >= self.seq_modulus
             gap_limit = 0 if cannot_wrap else min(gap_limit, SMALLEST_RESTART)
         if increase < gap_limit:
@@ -353,7 +353,7 @@ class Parser(ABC):
         # previous counter. The first frames after a restart, which have low counters, are never taken for late frames.
         decrease = (previous_seq - seq) % self.seq_modulus
         if decrease <= MAX_LATE_FRAMES and seq > MAX_LATE_FRAMES and not is_clock_reset:
-            self._previous_seq = previous_seq
+            self._previous_seq = previous_seq  # a late frame does not change the counter of the latest frame
             self.counts.lost = max(0, self.counts.lost - 1)
             return (GAP,)
         self.counts.restarts += 1
@@ -368,7 +368,7 @@ class Parser(ABC):
             dropped_size: Number of bytes that are counted as dropped if `raw` is not a frame.
 
         Returns:
-            A list with the frame; an empty list if `raw` is not a frame.
+            A list with the frame, to which callers add other frames; an empty list if `raw` is not a frame.
         """
         try:
             frame = decode(raw)

@@ -111,7 +111,7 @@ class Field(Settings, frozen=True, kw_only=True, omit_defaults=True):
         if self.type_name == PADDING:
             return
         if not self.name:
-            raise WrongKey("name")
+            raise WrongKey("name")  # without an expected value, the error states that the key is missing
         expected_none = f"none, because only the type {PADDING} may have one"
         if self.count != 1:  # 1 is the default, which means that no count is given
             raise WrongKey("count", expected_none, self.count)
@@ -191,10 +191,11 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             WrongKey: For the first key that is missing or not valid.
         """
         if self.checksum not in CHECKSUMS:
+            # `CHECKSUMS` contains the `SUMS`, which are listed, and the CRCs of the catalogue, which are too many.
             expected = f"one of {', '.join(SUMS)}, or a CRC of the catalogue, such as crc-16/modbus"
             raise WrongKey("checksum", expected, self.checksum)
         if self.framing == SYNC and self.sync_bytes is None:
-            raise WrongKey("sync")  # the key is missing
+            raise WrongKey("sync")  # without an expected value, the error states that the key is missing
 
         names = [field.name for field in self.fields]
         has_duplicate_names = len(set(names)) < len(names)
@@ -202,7 +203,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
             raise WrongKey("fields", "names that differ", names)
         if not self.columns.channels:
             raise WrongKey("fields", "one or more that are channels", names)
-        if self.t_us_modulus < 1:
+        if self.t_us_modulus < 1:  # the clock would wrap at 0 us or less, because its scale is negative or too small
             raise WrongKey("fields", "a clock with a positive scale that counts microseconds or more", names)
 
         checksum_start = len(self.sync) + self.body.size  # position of the checksum, which is at the end of the frame
@@ -285,7 +286,8 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
         checksum_start = self.length - self.selected_checksum.size
         if self.compute_checksum(data[:checksum_start]) != data[checksum_start:]:
             raise ChecksumError("the checksum is wrong")
-        # Integers of three bytes are converted here, because `struct` can only return their bytes.
+        # Integers of three bytes are converted here, because `struct` can only return their bytes. All other fields are
+        # numbers already.
         numbers = [
             int.from_bytes(number, self.byte_order, signed=field.type_name == "i24")
             if isinstance(number, bytes)
@@ -321,7 +323,7 @@ class FrameLayout(FrameSection, frozen=True, tag="described", dict=True, kw_only
                 2 * self.length + 2,
                 lambda stuffed_frame: self.decode(stuffing.decode(stuffed_frame)),
             )
-        # Without a counter, this is the modulus of the first field, which is never used.
+        # Without a counter, the modulus of the first field takes the place of the modulus, which is then never used.
         parser.seq_modulus = self.fields[self.columns.seq_column or 0].modulus
         parser.t_us_modulus = self.t_us_modulus
         return parser
@@ -356,7 +358,8 @@ class SyncParser(Parser):
             if len(candidate) < length:  # an unfinished frame
                 self._tail = candidate
                 return frames
-            # If the bytes are not a frame, one byte is dropped, because a frame may begin at the next byte.
+            # If the bytes are not a frame, the list is empty, and one byte is dropped, because a frame may begin at the
+            # next byte.
             decoded = self._try_decode(self.layout.decode, candidate, dropped_size=1)
             frames += decoded
             parsed_end = start + (length if decoded else 1)
@@ -378,5 +381,6 @@ class DatagramParser(SyncParser):
         if len(data) % length != 0:
             self.counts.count_rejected(len(data))
             return []
+        # Of each piece, `_try_decode` returns a list with its frame, or an empty list if it is damaged.
         pieces = (data[start : start + length] for start in range(0, len(data), length))
         return [frame for piece in pieces for frame in self._try_decode(self.layout.decode, piece, dropped_size=length)]

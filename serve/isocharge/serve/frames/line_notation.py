@@ -29,35 +29,38 @@ _TELEPLOT = r">([^\s:>][^:]*):(?:[^|]*;)?(?:([0-9.]+):)?([^:;|]*);?(?:\|.*)?"
 def clean_text(text: str) -> str:
     """Return the part of a line that may contain numbers; empty for a blank line, a comment or a text of Teleplot.
 
-    Colours, quotes around numbers and other notations without a meaning are removed.
+    Colours, quotes around numbers and other notations without a meaning are removed. Names in capital letters, such as
+    `_COLOURS`, are regular expressions.
 
     Args:
         text: The line.
 
     Raises:
-        ValueError: If the checksum of a sentence is wrong.
+        ValueError: If the checksum of an NMEA sentence, which begins with `$`, is wrong.
     """
     if "\x1b" in text:
         text = re.sub(_COLOURS, "", text)
     if not text.isascii():
         # Some programs write blanks of fixed width, a byte order mark at the beginning of a file, or dashes as minus.
-        text = re.sub("[^\\S\t]|\ufeff", " ", text)
+        text = re.sub("[^\\S\t]|\ufeff", " ", text)  # any blank except a tab, or the mark
         text = re.sub("[\u2010-\u2015\u2212]", "-", text)
 
-    # Join a sign with the number behind it, as in `A: - 3.5`, unless the sign may be a minus between two numbers.
+    # Join a sign with the number behind it: `A: - 3.5` becomes `A: -3.5`. A sign behind a number is left alone, because
+    # it may be a minus between two numbers.
     text = re.sub(r"(^|[:=,;(\[] *)([-+]) +(?=[.0-9])", r"\1\2", text.strip())
 
-    # Separate numbers from each other, as in `+3.5-3.4`.
+    # Separate numbers from each other: `+3.5-3.4` becomes `+3.5 -3.4`.
     if re.fullmatch(_SIGNED_NUMBERS, text):
         text = re.sub(r"(?<=[0-9])(?=[-+])", " ", text)
 
-    # Separate names from numbers, as in `A+3.5B-3.4`. A line in which a name occurs twice is a header (`ch-1, ch-2`).
+    # Separate names from numbers: `A+3.5B-3.4` becomes `A=+3.5 B=-3.4`. A line in which a name occurs twice is a header
+    # (`ch-1, ch-2`), and remains unchanged.
     if re.fullmatch(f"(?:{_NAMED_NUMBER}){{2,}}", text):
         named_numbers = re.findall(_NAMED_NUMBER, text)
-        if len(dict(named_numbers)) == len(named_numbers):
+        if len(dict(named_numbers)) == len(named_numbers):  # all names differ
             text = " ".join(f"{name}={number}" for name, number in named_numbers)
 
-    # Remove quotes around numbers, and then the notation of Teleplot, of NMEA sentences and of comments.
+    # Remove quotes around numbers, then the notation of Teleplot (`>`), of NMEA sentences (`$`) and of comments (`#`).
     if '"' in text or "'" in text:
         text = re.sub(_QUOTED_NUMBER, r"\2", text)
     if text[:1] == ">":
@@ -76,9 +79,12 @@ def _teleplot_content(text: str) -> str:
     value and its time, as in `t_ms:1010;"A":801.2§pC`.
 
     The result is empty if the flags state that the value is a text (t) or a point in a plane (xy). A line that is no
-    Teleplot line is returned unchanged.
+    Teleplot line is returned unchanged, unless one of the texts between its commas is such a flag.
+
+    Args:
+        text: A line that begins with `>`.
     """
-    flags = text.rpartition("|")[2].split(",")
+    flags = text.rpartition("|")[2].split(",")  # behind the last bar, or of the whole line without a bar
     if "t" in flags or "xy" in flags:
         return ""
     teleplot = re.fullmatch(_TELEPLOT, text)

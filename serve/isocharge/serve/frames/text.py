@@ -42,15 +42,7 @@ import numpy as np
 
 from isocharge.common.arrays import Array
 from isocharge.common.errors import printable
-from isocharge.serve.frames.frame import (
-    SEQ,
-    SEQ_MODULUS,
-    T_US_MODULUS,
-    TIMES_US,
-    Columns,
-    DelimitedParser,
-    Frame,
-)
+from isocharge.serve.frames.frame import SEQ, SEQ_MODULUS, T_US_MODULUS, TIMES_US, Columns, DelimitedParser, Frame
 from isocharge.serve.frames.line_notation import clean_text
 from isocharge.serve.frames.text_lines import Line, header_names, line_values, parse_line
 
@@ -90,15 +82,15 @@ class Layout:
         Args:
             lines: The lines.
             new_names: Names for the values that have no names in the lines; empty if they are not known.
-            meanings: Meanings of the names of counters and clocks; see `TextParser`.
+            meanings: For each name that the device uses for its counter or its clock: `seq`, `t_us`, `t_ms` or `t_s`.
         """
         self.lines = lines
         self.patterns = [line.pattern for line in lines]
         self.names = [name for line in lines for name in line.names]
-        self.unnamed = [index for index, name in enumerate(self.names) if not name]
-        for index, name in zip(self.unnamed, new_names, strict=False):
+        self.unnamed = [index for index, name in enumerate(self.names) if not name]  # indices without a name
+        for index, name in zip(self.unnamed, new_names, strict=False):  # does nothing if `new_names` is empty
             self.names[index] = meanings.get(name, name)
-        words = tuple(word for line in lines for word in line.words)
+        words = tuple(word for line in lines for word in line.words)  # all text between the numbers except marks
         self.columns = Columns(self.names, (1.0,) * len(self.names), words=words)  # values in text have no scale
 
 
@@ -119,7 +111,7 @@ class TextParser(DelimitedParser):
         """
         super().__init__("text of a layout that is not clear yet", b"\n", MAX_LINE_LENGTH)
         self.layout: Layout | None = None
-        self._columns = columns
+        self._names_from_device_file = columns
         self._meanings = dict(meanings or {})
         self._headers: deque[str] = deque(maxlen=MAX_CYCLE_LINES)  # lines and comments without numbers
         self.seq_modulus = SEQ_MODULI[0]
@@ -155,18 +147,19 @@ class TextParser(DelimitedParser):
             piece: Bytes of the line, without the line feed.
 
         Raises:
-            ValueError: If the line cannot be parsed. The caller counts the line as rejected.
+            ValueError: If the line cannot be parsed. The caller then counts the line as rejected. A first line that may
+                be incomplete raises no error, and is counted here.
         """
-        size = len(piece) + 1  # with the line feed
+        size = len(piece) + 1  # number of bytes with the line feed
         is_first_line = self._is_first_line
         self._is_first_line = False
         line = _decoded(piece.strip(CONTROL_CHARACTERS)).strip()
         text = clean_text(line)
         if not text:  # the line is blank or a comment
-            self.unread_line = line or self.unread_line
+            self.unread_line = line or self.unread_line  # for messages to the user
             # A comment without numbers, such as `# t_ms,A,B,C`, may be the header with the names of the columns. No
             # header is needed after a layout has been recognised.
-            if self.layout is None and line and not parse_line(line).names:
+            if self.layout is None and line and not parse_line(line).names:  # there is a name for each number
                 self._headers.append(line)
             return []
         # The beginning of the first line may be missing, so that "1.2" may be the end of "801.2". The first line is
@@ -200,17 +193,18 @@ class TextParser(DelimitedParser):
 
         # The line has another layout. It may be a header that names the columns without names.
         line = parse_line(text)
-        self.unread_line = text
-        names = header_names(text, layout.lines[0])
-        if line.names or not names or all(layout.names):
+        self.unread_line = text  # for messages to the user
+        names_in_header = header_names(text, layout.lines[0])  # empty if the line is no header
+        if line.names or not names_in_header or all(layout.names):  # only a line without numbers has no `line.names`
             return self._reject(size)
-        self._set_layout(Layout(layout.lines, names, self._meanings))
+        self._set_layout(Layout(layout.lines, names_in_header, self._meanings))
         return []
 
     def _add_values(self, layout: Layout, position: int, values: tuple[float, ...], size: int) -> list[Frame]:
-        """Add the values of a line to the present cycle, and return the frame if the cycle is complete.
+        """Add the values of a line to the present cycle, which are the lines of one frame.
 
-        If a line of the cycle is lost, the other lines of the cycle are rejected.
+        If the cycle is complete, a list with its frame is returned, and otherwise an empty list. If a line of the cycle
+        is lost, the other lines of the cycle are rejected.
 
         Args:
             layout: Layout of the lines.
@@ -220,13 +214,14 @@ class TextParser(DelimitedParser):
         """
         if position != len(self._cycle):  # a line of a cycle is lost
             self._drop_cycle()
-            if position > 0:
+            if position > 0:  # otherwise, the line begins a new cycle
                 return self._reject(size)
         self._cycle.append((values, size))
         if len(self._cycle) < len(layout.patterns):
             return []
         values_of_lines, sizes = zip(*self._cycle, strict=True)
         self._cycle = []
+        # `sum` joins the tuples of values. The list contains one frame, or none if a value is not valid.
         frames = self._try_decode(layout.columns.frame, sum(values_of_lines, ()), dropped_size=sum(sizes))
         for frame in frames:
             self._update_seq_modulus(frame.seq or 0)
@@ -253,7 +248,7 @@ class TextParser(DelimitedParser):
         if seq < previous_seq and previous_seq + 1 in SEQ_MODULI:
             self.seq_modulus = previous_seq + 1
         elif seq >= self.seq_modulus:
-            byte_modulus = SEQ_MODULI[0]
+            byte_modulus = SEQ_MODULI[0]  # 256; `SEQ_MODULUS` is 65536
             self.seq_modulus = byte_modulus if seq < byte_modulus else SEQ_MODULUS
 
     def _collect_line(self, text: str, size: int) -> list[Frame]:
@@ -271,12 +266,12 @@ class TextParser(DelimitedParser):
         """
         line = parse_line(text, meanings=self._meanings)
         self.unread_line = text
-        if not line.names:
+        if not line.names:  # the line has no numbers, because each number has a name, which may be empty
             self._headers.append(text)
-            if len(self._headers) == MAX_CYCLE_LINES:
+            if len(self._headers) == MAX_CYCLE_LINES:  # the largest length of `_headers`, which drops its oldest line
                 return self._reject(size)
             return []
-        if self._headers:  # words between the numbers are not names of numbers that a header names
+        if self._headers:  # if a header names the numbers, the words between the numbers are not their names
             line_below_header = parse_line(text, has_header=True, meanings=self._meanings)
             if any(header_names(header, line_below_header) for header in self._headers):
                 line = line_below_header
@@ -307,14 +302,14 @@ class TextParser(DelimitedParser):
         if not frame_lines:
             return None
         # Name the values that have no names. The device file has priority, and then the latest header.
-        unnamed_count = frame_lines[0].names.count("")  # in a cycle of several lines, all values have names
+        unnamed_count = frame_lines[0].names.count("")  # 0 for a frame of several lines, whose values all have names
         names_in_headers = [header_names(header, frame_lines[0]) for header in reversed(self._headers)]
-        possible_names = (self._columns, *names_in_headers)
-        new_names = next((names for names in possible_names if len(names) == unnamed_count), ())
-        layout = Layout(frame_lines, new_names, self._meanings)
-        if self._columns and "" in layout.names:  # the device file names another number of columns
+        possible_names = (self._names_from_device_file, *names_in_headers)
+        names_of_unnamed = next((names for names in possible_names if len(names) == unnamed_count), ())
+        layout = Layout(frame_lines, names_of_unnamed, self._meanings)
+        if self._names_from_device_file and "" in layout.names:  # the device file names another number of columns
             return None
-        # In a cycle of several lines, all values have names, which digits and numbers of channels have not.
+        # Hexadecimal digits and the number of a channel would be misread. Both occur only in frames of one line.
         has_one_line = len(layout.patterns) == 1
         if has_one_line and (_has_hexadecimal_digits(layout, lines) or _has_channel_number(layout, lines)):
             return None
@@ -323,8 +318,8 @@ class TextParser(DelimitedParser):
     def _set_layout(self, layout: Layout) -> None:
         """Set the layout, its description in the attribute `format`, and the modulus of the clock."""
         self.layout = layout
-        # A clock in s is assumed to be a time of day, which wraps after 86400 s. Other clocks wrap after 2^32 counts.
-        unit_us = round(layout.columns.clock_unit_us)
+        # A clock in s is a time of day, which wraps after 86400 counts. Others wrap after `T_US_MODULUS` = 2^32 counts.
+        unit_us = round(layout.columns.clock_unit_us)  # duration of one count of the clock
         is_time_of_day = unit_us == TIMES_US["t_s"]
         self.t_us_modulus = (86_400 if is_time_of_day else T_US_MODULUS) * unit_us
         names = [name for name in layout.names if name]
@@ -353,8 +348,8 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     """Return the lines of one frame; empty if the lines do not repeat, or if it is not clear which lines are frames.
 
     A cycle is a sequence of lines that repeats. A cycle is recognised if the last lines consist of several equal
-    cycles. Lines are equal if their skeletons are equal. The last cycle consists of the lines after the previous
-    occurrence of the last line, including the last line itself.
+    cycles. Lines are equal if their skeletons, the texts without the numbers, are equal. The last cycle consists of the
+    lines after the previous occurrence of the last line, including the last line itself.
 
     If some lines occur several times in a cycle, the most frequent line is a frame. If all lines of a cycle differ and
     every value has a name, a frame consists of all lines of a cycle. If all lines of a cycle differ and some value has
@@ -370,23 +365,23 @@ def _frame_lines(lines: Sequence[Line], repeats: int) -> Sequence[Line]:
     if last_skeleton not in earlier_skeletons:
         return []
     cycle_length = earlier_skeletons[::-1].index(last_skeleton) + 1
-    last_cycle = skeletons[-cycle_length:]
-    if skeletons[-repeats * cycle_length :] != repeats * last_cycle:
+    cycle_skeletons = skeletons[-cycle_length:]
+    if skeletons[-repeats * cycle_length :] != repeats * cycle_skeletons:
         return []
 
     repeated_lines = lines[-repeats * cycle_length :]
-    cycle = repeated_lines[:cycle_length]
-    has_equal_lines = len(set(last_cycle)) < cycle_length
-    if has_equal_lines or cycle_length == 1:  # for example, three frames and then a temperature
-        most_frequent_line = max(cycle, key=lambda line: skeletons.count(line.skeleton))
+    cycle_lines = repeated_lines[:cycle_length]
+    has_equal_lines = len(set(cycle_skeletons)) < cycle_length  # for example, three frames and then a temperature
+    if has_equal_lines or cycle_length == 1:  # the only line of a cycle is a frame
+        most_frequent_line = max(cycle_lines, key=lambda line: skeletons.count(line.skeleton))
         return [most_frequent_line]
-    if all(all(line.names) for line in cycle):  # every value has a name
-        first = _first_line(repeated_lines, cycle_length)
-        return repeated_lines[first : first + cycle_length]
+    if all(all(line.names) for line in cycle_lines):  # every value has a name
+        start = _frame_start_index(repeated_lines, cycle_length)  # reading may have begun within a cycle
+        return repeated_lines[start : start + cycle_length]
     # Collect the texts of the line at each position in the cycle. The frame is the line whose text varies, if there is
     # exactly one such line.
     texts = [{line.text for line in repeated_lines[position::cycle_length]} for position in range(cycle_length)]
-    varying = [line for line, texts_of_line in zip(cycle, texts, strict=True) if len(texts_of_line) > 1]
+    varying = [line for line, texts_of_line in zip(cycle_lines, texts, strict=True) if len(texts_of_line) > 1]
     return varying if len(varying) == 1 else []
 
 
@@ -445,21 +440,24 @@ def _has_channel_number(layout: Layout, lines: Sequence[Line]) -> bool:
 
 
 def _counts_up_repeatedly(column: Array) -> bool:
-    """Return whether a column contains the numbers of channels, as described in `_has_channel_number`.
+    """Return whether a column contains three to eight numbers of channels that count up repeatedly, such as 1 to 3.
+
+    The numbers are consecutive whole numbers, and the smallest one is below 100. At least half of the steps from line
+    to line lead to the next number, or from the last number to the first.
 
     Args:
         column: Numbers in the column, shape (lines,).
     """
     # The different numbers in ascending order, and for each line the index of its number among them
     numbers, ranks = np.unique(column, return_inverse=True)
-    if not 3 <= len(numbers) <= 8 or numbers[0] not in range(100):
+    if not 3 <= len(numbers) <= 8 or numbers[0] not in range(100):  # the smallest must be a whole number
         return False
     are_consecutive = np.all(np.diff(numbers) == 1.0)
-    leads_to_next = np.diff(ranks) % len(numbers) == 1
+    leads_to_next = np.diff(ranks) % len(numbers) == 1  # the first number follows the last
     return bool(are_consecutive and leads_to_next.mean() >= 0.5)
 
 
-def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
+def _frame_start_index(lines: Sequence[Line], cycle_length: int) -> int:
     """Find the line with which a frame begins in repeated cycles of lines, and return its index.
 
     Reading may start within a cycle. If every line has a clock, the first line is chosen so that the clocks of a frame
@@ -471,7 +469,7 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
         lines: Lines of whole cycles, in which every value has a name.
         cycle_length: Number of lines in a cycle.
     """
-    fields_of_lines = [
+    fields_of_lines = [  # for each line: its values by their names
         dict(zip(line.names, line_values(line.pattern, line.text) or (), strict=False)) for line in lines
     ]
 
@@ -480,12 +478,13 @@ def _first_line(lines: Sequence[Line], cycle_length: int) -> int:
 
         The key has three elements. The first element is the time from the first to the last line of a frame that would
         begin with this line, or 0 if some line has no clock. The second element states whether the line begins without
-        a counter. The third element is the first name in the line.
+        a counter. The third element is the first name in the line. A counter has the name `SEQ`, and a clock has one of
+        the names in `TIMES_US`.
         """
-        frame = fields_of_lines[first : first + cycle_length]
-        clocks = [fields[name] for fields in frame for name in TIMES_US if name in fields]
-        duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0
-        first_name = next((name for name in frame[0] if name not in TIMES_US), "")  # "" if the line has only a clock
+        frame_fields = fields_of_lines[first : first + cycle_length]  # values by name, for each line of the frame
+        clocks = [line_fields[name] for line_fields in frame_fields for name in TIMES_US if name in line_fields]
+        duration = clocks[-1] - clocks[0] if len(clocks) == cycle_length else 0.0  # 0 unless every line has a clock
+        first_name = next((name for name in frame_fields[0] if name not in TIMES_US), "")  # "" for only a clock
         begins_without_counter = first_name != SEQ  # False is sorted before True
         return duration, begins_without_counter, first_name
 
@@ -502,9 +501,10 @@ def encode_text(frame: Frame, notation: Literal["csv", "json"]) -> bytes:
         notation: Whether the line is a CSV row that contains only the channels, or a JSON object that also contains the
             frame counter and the clock.
     """
-    numbers = [f"{value:.7g}" for value in frame.values]
+    numbers = [f"{value:.7g}" for value in frame.values]  # as texts
     if notation == "csv":
         return (",".join(numbers) + "\n").encode()
+    # JSON needs numbers instead of texts. There may be more letters than channels, so `strict` is False.
     values = dict(zip(frame.names or ascii_uppercase, map(float, numbers), strict=False))
     fields = {SEQ: frame.seq, "t_us": frame.t_us} | values
     return f"{json.dumps({name: value for name, value in fields.items() if value is not None})}\n".encode()

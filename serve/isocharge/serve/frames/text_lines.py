@@ -118,7 +118,8 @@ class Line(NamedTuple):
 def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, str] = MappingProxyType({})) -> Line:
     """Divide a line of text into its numbers and its skeleton, which is the text between the numbers.
 
-    A line in which a minus or a comma may have two meanings (see `text_parts.UNCLEAR`) is returned without numbers.
+    A line in which a minus or a comma may have two meanings (see `text_parts.UNCLEAR`) is returned without numbers,
+    because `parts_of` then returns no parts.
 
     Args:
         text: The line, as `clean_text` returns it.
@@ -131,11 +132,12 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
     """
     if not text.replace("\t", " ").isprintable():
         raise ValueError(f"expected printable characters, got {text[:100]!r}")
-    number_pattern = NUMBER  # of the numbers in the skeleton
+    number_pattern = NUMBER  # regular expression of each decimal number in the skeleton
     text_with_points = text
     if _has_decimal_commas(text):
         number_pattern = NUMBER_WITH_COMMA
-        # Replace each decimal comma by a point, and each time by itself. All positions in the text remain the same.
+        # Replace each decimal comma by a point. The expression also matches a time, such as `12:30:05,5`, which remains
+        # unchanged. All positions in the text remain the same.
         text_with_points = re.sub(_DECIMAL_COMMA, lambda match: match["time"] or ".", text)
     parts = parts_of(text_with_points)
     counters = {SEQ, *TIMES_US, *meanings}
@@ -147,7 +149,7 @@ def parse_line(text: str, *, has_header: bool = False, meanings: Mapping[str, st
         names=tuple(meanings.get(name, name) for name in names_with_units),
         starts=tuple(part.start for part in parts if part.is_number),
         is_prose=_is_prose(parts),
-        words=tuple(part.name for part in parts if part.symbol in "kquw"),  # keys, texts in quotes, units and words
+        words=tuple(part.name for part in parts if part.symbol in "kquw"),  # key, quoted text, unit, word
     )
 
 
@@ -163,20 +165,24 @@ def _has_decimal_commas(text: str) -> bool:
     - The line has brackets, as in `(4,3) (5,2)`. Even in a line with brackets, several commas are decimal commas if
       each number with a comma follows a colon or an equals sign.
     """
-    text = re.sub(f"{TIME}{FRACTION}?(?:{ZONE})?", "", text)
-    number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", text))  # `4,3` counts as one number
-    comma_count = len(re.findall("[0-9],[0-9]", text))
-    named_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", text))  # numbers with a comma and a name, as in `A:4,3`
-    if comma_count == 0 or re.search(_SEPARATING_COMMA, text):
+    values_text = re.sub(f"{TIME}{FRACTION}?(?:{ZONE})?", "", text)  # the line without its times
+    number_count = len(re.findall("[0-9]+(?:,[0-9]+)?", values_text))  # `4,3` counts as one number
+    comma_count = len(re.findall("[0-9],[0-9]", values_text))
+    named_comma_count = len(re.findall(r"[:=]\s*[-+]?[0-9]+,[0-9]", values_text))  # with a name, as in `A:4,3`
+    if comma_count == 0 or re.search(_SEPARATING_COMMA, values_text):
         return False
-    if number_count == 1:
-        return named_count == 1
-    are_all_named = comma_count > 1 and named_count == comma_count
-    return are_all_named or re.search(r"[\[({]", text) is None
+    if number_count == 1:  # for example `4,3`, which stands for two numbers if it has no name
+        return named_comma_count == 1
+    are_all_named = comma_count > 1 and named_comma_count == comma_count
+    return are_all_named or re.search(r"[\[({]", values_text) is None  # None if the line has no brackets
 
 
 def _skeleton(parts: list[Part], names: list[str], number_pattern: str) -> tuple[str, ...]:
-    """Return the skeleton of a line; see `Line`.
+    """Return the skeleton of a line, which consists of regular expressions that match all lines of the same layout.
+
+    There is one regular expression for each part of the line, and one for the blanks before some parts. The expression
+    of a number is a group. The kind of a part is, for example, number, hexadecimal, key (a name before a colon or an
+    equals sign), word, or mark (another character, such as a comma).
 
     Args:
         parts: Parts of the line.
@@ -184,24 +190,24 @@ def _skeleton(parts: list[Part], names: list[str], number_pattern: str) -> tuple
         number_pattern: Regular expression of a decimal number.
     """
     fixed_words = {*names, *CHARGE_UNITS}  # must be the same in all lines of a layout; other words may change
-    patterns = []
+    skeleton = []
     previous_kind = ""
     for part in parts:
         if "mark" in (previous_kind, part.kind):
-            patterns.append(r"\s*+")  # the number of blanks beside a mark may change, and there may be none
+            skeleton.append(r"\s*+")  # the number of blanks beside a mark may change, and there may be none
         elif part.is_after_blank:
-            patterns.append(r"\s++")
+            skeleton.append(r"\s++")
         # A word that directly follows a number, as in `3.5mV`, is the unit of the number.
         is_unit = previous_kind in ("number", "hexadecimal") and not part.is_after_blank
         if part.is_number:
             pattern = number_pattern if part.kind == "number" else PATTERNS[part.kind]
-            patterns.append(f"({pattern})")
+            skeleton.append(f"({pattern})")
         elif part.kind in ("key", "mark") or part.name in fixed_words or is_unit:
-            patterns.append(re.escape(part.content))
+            skeleton.append(re.escape(part.content))  # matches only this text
         else:
-            patterns.append(PATTERNS[part.kind])
+            skeleton.append(PATTERNS[part.kind])  # matches any text of the same kind
         previous_kind = part.kind
-    return tuple(patterns)
+    return tuple(skeleton)
 
 
 def _is_prose(parts: list[Part]) -> bool:
@@ -233,7 +239,7 @@ def _words(parts: list[Part], pattern: str) -> list[str]:
     ]
 
 
-def _unique(names: list[str]) -> list[str]:
+def _without_repeated(names: list[str]) -> list[str]:
     """Replace every name that occurs several times by an empty name, except the names of clocks."""
     return [name if name in TIMES_US or names.count(name) == 1 else "" for name in names]
 
@@ -243,7 +249,7 @@ def _alternating_names(parts: list[Part], *, has_header: bool) -> list[str]:
 
     The names are the words next to the numbers. They stand either before all numbers, as in `C,7,A,3` and `C[7] A[3]`,
     or behind all numbers, as in `7 C, 3 A`. If two of the words are equal, no word is a name, because words that repeat
-    are units or states. Words with another meaning are also taken for names if they alternate with the numbers.
+    are units or states. All other words that alternate with the numbers are taken for names, whatever they mean.
 
     If a header names the numbers, the words are not names but the contents of other columns. The exception is a line
     with a single word and a single number, as in `A,3.5`: even below a header, the word is the name of the number.
@@ -253,13 +259,15 @@ def _alternating_names(parts: list[Part], *, has_header: bool) -> list[str]:
         has_header: Whether a header names the numbers.
     """
     # The shape has one symbol for each part: t for a time, u for a unit, w for another word, and 0 for a number. Marks
-    # stand for themselves. A time may stand before a single pair, and a unit behind it.
+    # stand for themselves. A time may stand before a single pair, and a unit behind it, as in `12:30:05;A,3.5pC`.
     shape = shape_of(parts)
     is_single_pair = re.fullmatch("[t ,;]*[uw][,;|]0[uw]?", shape) is not None
     if is_single_pair or (shape.count("0") > 1 and not has_header):
         for pattern in (_WORD_BEFORE, _WORD_BEHIND):
-            names = _words(parts, pattern)
-            if all(_unique(names)) and CHARGE_UNITS.isdisjoint(names):
+            names = _words(parts, pattern)  # the word of each number; empty for a number without a word
+            # `_without_repeated` replaces repeated names by empty texts. Every number needs a name of its own, and no
+            # name may be a unit.
+            if all(_without_repeated(names)) and CHARGE_UNITS.isdisjoint(names):
                 return names
     return []
 
@@ -274,28 +282,33 @@ def _preceding_names(parts: list[Part], counters: Container[str]) -> list[str]:
 
     - If no word stands before the first number, but one stands behind the last number, the words are units.
     - If only one of several numbers would have a name, as in `Data: 3.5, 4.1`, the word is taken for a label of the
-      whole line. A word is a label if it is no key, or if it stands before the first number. Counters and clocks keep
-      their names.
+      whole line, unless it is a key behind the first number. A key stands before a colon or an equals sign. Counters
+      and clocks keep their names.
 
     Args:
         parts: Parts of the line.
         counters: Names of counters and clocks.
     """
-    nearest_names = _unique(_words(parts, _NEAREST_NAME))
-    second_names = _unique(_words(parts, _SECOND_NAME))
+    # `_words` returns a word for each number, or an empty text. `_without_repeated` replaces repeated words by empty
+    # texts.
+    nearest_names = _without_repeated(_words(parts, _NEAREST_NAME))
+    second_names = _without_repeated(_words(parts, _SECOND_NAME))
     names = [nearest or second for nearest, second in zip(nearest_names, second_names, strict=True)]
-    words = {part.name for part in parts if part.kind == "word"}  # without the keys
-    value_indices = [index for index, name in enumerate(names) if name not in TIMES_US]  # of all numbers except clocks
+    plain_words = {part.name for part in parts if part.kind == "word"}  # without the keys
+    # Indices of all numbers except clocks, whose names are `TIMES_US`
+    value_indices = [index for index, name in enumerate(names) if name not in TIMES_US]
 
+    # If a word stands behind the last number, but none before the first, each word is a unit.
     # In the shape of a line, u is a unit and w is another word. Only marks may follow the last word.
     ends_with_word = re.search(r"[uw]\W*$", shape_of(parts)) is not None
     if value_indices and not names[value_indices[0]] and ends_with_word:
-        names = ["" if name in words else name for name in names]
+        names = ["" if name in plain_words else name for name in names]
 
+    # If only one of several numbers has a name, the name may be a label of the whole line.
     named_indices = [index for index in value_indices if names[index]]
     if len(value_indices) > 1 and len(named_indices) == 1:
         (index,) = named_indices
-        may_be_label = index == value_indices[0] or names[index] in words
+        may_be_label = index == value_indices[0] or names[index] in plain_words
         if may_be_label and names[index] not in counters:
             names[index] = ""
     return names
@@ -311,33 +324,36 @@ def _units(parts: list[Part], names: list[str]) -> list[str]:
         parts: Parts of the line.
         names: Name of each number; empty for a number without a name.
     """
+    # For each number: the word behind it, and the word between its name and it; empty if there is no such word
     words_behind = _words(parts, _UNIT_BEHIND)
-    words_before = _words(parts, _UNIT_BEFORE)
+    words_between = _words(parts, _UNIT_BEFORE)
 
     # The word `C` behind a number may be the name of an electrode, as in `7 C, 3 A`, and one `C` may be the unit of a
     # temperature (degrees Celsius). If the word occurs more often, it is the unit of the charges (coulomb).
-    is_coulomb = words_behind.count("C") > names.count("C") + 1
+    is_coulomb = words_behind.count("C") > names.count("C") + 1  # a name and a temperature do not suffice
     units = {*CHARGE_UNITS, "C"} if is_coulomb else CHARGE_UNITS
 
-    # Find the unit before the first name. The shape has one symbol for each part, and 0 for a number.
+    # Find the unit before the first name. The shape has one symbol for each part, and 0 for a number, so its length up
+    # to the first 0 is the number of parts before the first number. A unit may stand in brackets, as in `[nC]`.
     shape_before_numbers, _, _ = shape_of(parts).partition("0")
-    first_words = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
-    words_before_names = takewhile(lambda word: word not in names, first_words)
-    common_unit = next((word for word in words_before_names if word in units), "")
+    texts_before_numbers = [part.name.strip("[]") for part in parts[: len(shape_before_numbers)]]
+    texts_before_names = takewhile(lambda text: text not in names, texts_before_numbers)
+    common_unit = next((text for text in texts_before_names if text in units), "")
 
     # Take the word behind each number if it is a unit, else the word before it, else the common unit.
     return [
-        next((word for word in (behind.strip("[]"), before.strip("[]")) if word in units), common_unit)
-        for behind, before in zip(words_behind, words_before, strict=True)
+        next((word for word in (behind.strip("[]"), between.strip("[]")) if word in units), common_unit)
+        for behind, between in zip(words_behind, words_between, strict=True)
     ]
 
 
 def _with_units(names: list[str], units: list[str], counters: Container[str]) -> list[str]:
-    """Add the unit of charge or voltage of each number to its name, as in `A_nC` for `A = 3.5 nC`.
+    """Return the names, and add the unit of charge or voltage of each number, as in `A_nC` for `A = 3.5 nC`.
 
-    The unit pC is not added, and no unit is added to counters and clocks. A name may be followed by a number without a
-    unit and then by a number with a unit. If this is the case for several names, each of these names is moved to its
-    second number. For example, the names of `A: 512 (3.5 nC), B: 498 (4.1 nC)` become "", `A_nC`, "" and `B_nC`.
+    A name may be followed by a number without a unit and then by a number with a unit. If this is the case for several
+    names, each of these names is first moved to its second number. For example, the names of
+    `A: 512 (3.5 nC), B: 498 (4.1 nC)` become "", `A_nC`, "" and `B_nC`. The unit pC is not added, and no unit is added
+    to counters and clocks. A unit that is itself one of the names is not added either.
 
     Args:
         names: Name of each number; empty for a number without a name.
@@ -360,12 +376,13 @@ def _with_units(names: list[str], units: list[str], counters: Container[str]) ->
     for number, (name, unit) in enumerate(zip(moved_names, units, strict=True), 1):
         ending = "coulomb" if unit == "C" else unit  # `A_C` would be an electrode with the name C
         is_unit_added = unit not in ("", "pC") and ending not in names and name not in counters
+        # A number without a name is called by its number in the line, such as `ch2_nC`.
         names_with_units.append(f"{name or f'ch{number}'}_{ending}" if is_unit_added else name)
     return names_with_units
 
 
 def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None:
-    """Return the numbers in a line; None if the line has another skeleton.
+    """Return the numbers in a line; None if the line has another skeleton, which is the text between the numbers.
 
     Args:
         pattern: The `pattern` of a `Line` that has the expected skeleton.
@@ -377,7 +394,7 @@ def line_values(pattern: re.Pattern[str], text: str) -> tuple[float, ...] | None
     try:
         return tuple(map(float, match.groups()))
     except ValueError:  # a number is a time of day, is hexadecimal, has a decimal comma, or is `ovf`
-        return tuple(map(_value, match.groups()))
+        return tuple(map(_value, match.groups()))  # `_value` reads these notations, too
 
 
 def _value(number: str) -> float:
@@ -415,20 +432,23 @@ def header_names(header: str, line: Line) -> tuple[str, ...]:
         header: A line without numbers.
         line: The line.
     """
-    starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
+    # Positions in the line at which the numbers without names begin
+    unnamed_starts = [start for start, name in zip(line.starts, line.names, strict=True) if not name]
     header = header.lstrip("#%/ ").rstrip(IGNORED_AT_END)
     separator = _separator(header)  # None for blanks
     line_separator = "\t" if "\t" in line.text else _separator(line.skeleton)
-    if separator is None and line_separator is not None:  # the header is a message, such as `the tare is done`
+    # Words with blanks between them, above a line with separators, are a message, such as `the tare is done`.
+    if separator is None and line_separator is not None:
         return ()
     columns = header.split(separator)
-    if len(columns) != len(starts):
+    if len(columns) != len(unnamed_starts):
         # The header has one name for each column of the line. Select the columns that contain the numbers. If a number
         # is in the n-th column, the text of the line up to the first character of the number has n columns.
-        column_counts = [len(line.text[: start + 1].split(line_separator)) for start in starts]
-        columns = [columns[count - 1] for count in column_counts if count <= len(columns)]
+        column_numbers = [len(line.text[: start + 1].split(line_separator)) for start in unnamed_starts]
+        # If the header has fewer columns than the line, some numbers get no name, so that the header is refused below.
+        columns = [columns[number - 1] for number in column_numbers if number <= len(columns)]
     # A label with a colon may stand before a name, as in `Data: A, B, C`.
     names = tuple(column.rpartition(":")[2].strip(" \"'") for column in columns)
     are_names = all(re.match(r"[^\W\d]", name) for name in names)
-    are_different = len(set(names)) == len(starts)  # false, too, if there are fewer names than numbers
+    are_different = len(set(names)) == len(unnamed_starts)  # false, too, if there are fewer names than numbers
     return names if are_names and are_different else ()

@@ -125,14 +125,14 @@ def parts_of(text: str) -> list[Part]:
     for match in _PART.finditer(text.rstrip(IGNORED_AT_END)):
         kind = str(match.lastgroup)  # name of the group that matches
         content = match[0]
-        symbol = SYMBOLS.get(kind, content[0])  # a mark stands for itself
+        symbol = SYMBOLS.get(kind, content[0])  # a mark is not in `SYMBOLS`, because it stands for itself
         if kind in ("word", "key") and content.strip("[]") in CHARGE_UNITS:
-            symbol = "u"
+            symbol = "u"  # a unit
         start = match.start()
         is_after_blank = text[start - 1 : start].isspace()  # false for the first part, which has no text before it
         parts.append(Part(kind, symbol, content, start, is_after_blank))
     for position in _index_positions(parts):
-        parts[position] = parts[position]._replace(kind="key", symbol="k")
+        parts[position] = parts[position]._replace(kind="key", symbol="k")  # an index is the name of the next number
     return parts
 
 
@@ -163,6 +163,9 @@ def _index_positions(parts: list[Part]) -> list[int]:
     def first_numbers(pair: str) -> list[int]:
         """Return the position of the first number of each pair at the end of the line; empty if there is no pair.
 
+        The pairs contain the last numbers of the line. A word or a mark may follow the last pair. `shape` contains a 0
+        for each number of the line, and `number_positions` contains the position of each of these zeros.
+
         Args:
             pair: Regular expression of the shape of a pair, in which each number is a 0.
         """
@@ -171,9 +174,10 @@ def _index_positions(parts: list[Part]) -> list[int]:
         if pairs is None:
             return []
         paired_count = pairs[0].count("0")  # the pairs consist of this many numbers, which are the last of the line
-        return number_positions[-paired_count::2]
+        return number_positions[-paired_count::2]  # every second one is the first number of a pair
 
-    # Find pairs such as `1:801`. A closing bracket may follow the first number.
+    # Find pairs such as `1:801` and `1)=801`, in which a closing bracket may follow the first number. In a line without
+    # numbers, both counts are 0, and the empty list is returned.
     positions = first_numbers(r"0[)\]]?[:=]0")
     has_only_pairs = len(number_positions) == 2 * len(positions)
     if len(positions) > 1 or has_only_pairs:
@@ -183,6 +187,6 @@ def _index_positions(parts: list[Part]) -> list[int]:
     positions = first_numbers(r"[uw#(\[=]0[)\]>(\[]?0")
     first_contents = [parts[position].content for position in positions]
     numerals = [str(number) for number in range(len(positions) + 1)]
-    counts_up = first_contents in (numerals[:-1], numerals[1:])  # from 0, or from 1
+    counts_up = first_contents in (numerals[:-1], numerals[1:])  # "0", "1", ... or "1", "2", ...
     labels = {parts[position - 1].content for position in positions}  # the words or marks before the first numbers
     return positions if len(positions) > 1 and counts_up and len(labels) == 1 else []

@@ -120,7 +120,7 @@ checksum `sum-8/inverted` is the sum of the bytes with every bit inverted.
 def _crcs() -> Iterator[tuple[str, Checksum]]:
     """Yield each CRC of one to four bytes under each of its names, such as `crc-16/modbus` for `CRC16-MODBUS`."""
     for name in (*anycrc.models, *anycrc.aliases):
-        match = re.fullmatch(r"CRC(8|16|24|32)(?:-(.+))?", name)
+        match = re.fullmatch(r"CRC(8|16|24|32)(?:-(.+))?", name)  # groups: number of bits, and suffix
         if match is not None:
             suffix = f"/{match[2].lower()}" if match[2] else ""
             yield f"crc-{match[1]}{suffix}", Checksum(anycrc.Model(name).calc, int(match[1]) // 8)
