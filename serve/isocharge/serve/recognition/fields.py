@@ -51,7 +51,8 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
         name.
     """
     # A step is regular if it differs from the median step by at most 70 %, or by at most 1, because a slow clock may
-    # repeat some of its values. Steps over lost or damaged frames are not regular.
+    # repeat some of its values. Steps over lost or damaged frames are not regular, so only three quarters of the steps
+    # (`INTACT_SHARE`) need to be regular.
     median_step = np.median(steps)
     regular_steps = steps[np.abs(steps - median_step) <= max(1.0, 0.7 * median_step)]
     is_regular = len(regular_steps) >= INTACT_SHARE * len(steps) and regular_steps.min() >= 0.0
@@ -60,8 +61,8 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
         return
 
     # If only the high bytes of a number are a counter, and its low bytes belong to the channel beside the counter, the
-    # number increases by a power of 256 from frame to frame. A number that increases at the rate of such a shifted
-    # counter is not a clock.
+    # number increases by a power of 256 from frame to frame. The rates of such shifted counters are compared together
+    # with those of the clocks. If a shifted counter has the nearest rate, the number is not a clock.
     tick_rate_Hz = float(regular_steps.mean()) * frame_rate_Hz
     shifted_counter_rates_Hz = [frame_rate_Hz * 256.0**byte_count for byte_count in (1, 2, 3)]
     known_rates_Hz = (*CLOCKS, *shifted_counter_rates_Hz)
@@ -73,7 +74,7 @@ def possible_meanings(steps: Array, frame_rate_Hz: float, tolerance: float = 0.0
     if increases_by_one and not (is_clock and repeats_values):
         yield SEQ, 1.0
     if is_clock:
-        yield CLOCKS[nearest_rate_Hz]
+        yield CLOCKS[nearest_rate_Hz]  # name of the field, and value of one tick
 
 
 def count_wraps(steps: Array) -> int:
@@ -153,15 +154,15 @@ def possible_parts(rows: Bytes, order: ByteOrder, frame_rate_Hz: float) -> list[
         For each of the `length` bytes, a list of parts, of which the first is padding.
     """
     usual, is_constant = usual_bytes(rows)
-    constant_bytes = np.where(is_constant, usual.astype(int), -1)
+    constant_bytes = np.where(is_constant, usual.astype(int), -1)  # -1 for a byte that varies
     byte_step = 1 if order == "little" else -1
     parts_at_each_byte: list[list[Part]] = []
     for position in range(rows.shape[1] - LARGEST_SIZE):
-        # One byte of padding
-        parts = [Part("", PADDING, 1, Weights.constant if is_constant[position] else Weights.noise)]
+        # One byte of padding, which has no name. `Weights` contains constant scores, in bits.
+        parts = [Part("", PADDING, size=1, score=Weights.constant if is_constant[position] else Weights.noise)]
         for type_name in STRUCT_FORMATS:  # such as "u16", whose size is 16 bits
             end = position + int(type_name[1:]) // 8
-            if all(is_constant[position:end]):
+            if all(is_constant[position:end]):  # a channel that never changes
                 parts.append(Part(CHANNEL, type_name, end - position, Weights.constant, is_constant=True))
                 continue
             lowest_first = range(position, end)[::byte_step]  # positions of the bytes, that of the lowest byte first
@@ -190,7 +191,7 @@ def _number_parts(
         frame_rate_Hz: Number of frames per second, Hz.
     """
     size = len(constant_bytes)
-    values = _values(number_bytes, type_name)
+    values = _decoded_values(number_bytes, type_name)
     steps = np.diff(values)
     magnitude = np.median(np.abs(values))
     unit = 1.0  # smallest step that the number can represent
@@ -200,7 +201,7 @@ def _number_parts(
         # The significant digits of a floating-point number of `size` bytes are in about `Weights.fraction` * `size` of
         # its bytes. Low bytes that are always 0 contain no digits. The smallest step of a number with n bytes of digits
         # is its magnitude divided by 256**n.
-        low_zero_byte_count = np.argmax(constant_bytes != 0)
+        low_zero_byte_count = np.argmax(constant_bytes != 0)  # index of the first byte that is not always 0
         unit = magnitude * 256.0 ** (low_zero_byte_count - Weights.fraction * size)
 
     counter_or_clock = _counter_or_clock(steps, constant_bytes, type_name, unit, frame_rate_Hz)
@@ -209,7 +210,8 @@ def _number_parts(
     if type_name == "i64":  # times only
         return
     # The magnitude is counted as one more step, the step from 0 to the first value. A type therefore has a lower score
-    # if its values are close to 0 or, for an unsigned type, close to the middle of its range (see `_values`).
+    # if its values are close to 0. `_decoded_values` has subtracted half of the range from the values of an unsigned
+    # type, so that 0 is the middle of its range.
     yield Part(CHANNEL, type_name, size, Weights.channel + _bits(np.append(steps, magnitude), unit, size))
 
 
@@ -237,10 +239,11 @@ def _counter_or_clock(
         # from the largest value to 0 by the small step forwards that it stands for.
         half_range = 1 << (8 * size - 1)
         steps = (steps + half_range) % (2 * half_range) - half_range
-    name, tick = next(possible_meanings(steps, frame_rate_Hz), ("", 1.0))  # "" if it is neither a counter nor a clock
+    # If several meanings are possible, the first one is the counter. The name is "" if the number has neither meaning.
+    name, tick = next(possible_meanings(steps, frame_rate_Hz), ("", 1.0))
     has_usual_size = size < 8 or tick in (1.0, 1e-3)  # only clocks in s, ms, us or ns have 8 bytes
-    # The modulo has removed the wraps at the end of the range. A number that wraps all the same has a smaller range,
-    # which its low bytes fill. The other bytes are not bytes of the number, but belong to another field.
+    # The modulo has removed the wraps at the end of the range. If the number still wraps, its high bytes belong to
+    # another field. For example, a counter of one byte wraps at 256, also if it is read with the next byte as a `u16`.
     has_foreign_bytes = count_wraps(steps) > 0
     if not name or not has_usual_size or has_foreign_bytes:
         return None
@@ -267,8 +270,8 @@ def split_frame(
     after this position is computed once and stored.
 
     Args:
-        parts_at_each_byte: Parts that may begin at each byte before the checksum. A part that does not end before the
-            checksum is not used.
+        parts_at_each_byte: Parts that may begin at each byte of the frame before the checksum. At each byte, at least
+            one part of one byte begins, which is padding. A part that does not end before the checksum is not used.
         sync_lengths: Possible lengths of the sync pattern, bytes; 0 if the frame has no sync pattern. If several
             lengths have the lowest score, the first of them is chosen.
         checksum_start: First byte that the checksum covers. The checksum covers either all bytes of a number or none of
@@ -283,6 +286,9 @@ def split_frame(
         """Find the division with the lowest score for the bytes from a given position to the end.
 
         The function tries each part that may begin at the position, and calls itself for the bytes after the part.
+        The results are cached. `parts_at_each_byte` lists the parts that may begin at each byte, and `checksum_start`
+        is the first byte that the checksum covers.
+
         Adjacent channels of one type form a group. A channel that begins a group adds `Weights.channel_group` to the
         score. A channel with a constant value cannot begin a group.
 
@@ -298,7 +304,8 @@ def split_frame(
         divisions = []
         for part in parts_at_each_byte[position]:
             end = position + part.size
-            if end > len(parts_at_each_byte) or position < checksum_start < end:  # the checksum covers only its end
+            # Leave out a part that ends behind the last byte, and a part of which the checksum covers only some bytes.
+            if end > len(parts_at_each_byte) or position < checksum_start < end:
                 continue
             channel_type = part.type_name if part.name == CHANNEL else ""
             begins_group = channel_type not in ("", previous_channel_type)
@@ -309,11 +316,12 @@ def split_frame(
             divisions.append((part.score + rest_score + group_score, (part, *rest_parts)))
         return min(divisions, key=itemgetter(0))  # of equal scores, the first division
 
-    # The best division begins at the first byte behind the sync pattern. The element with the index 0 is the score.
+    # For each length of the sync pattern, find the best division of the bytes behind the pattern: its score, its parts
+    # and the length. Choose the one with the lowest score, which is the element with the index 0.
     return min(((*best_division(length, ""), length) for length in sync_lengths), key=itemgetter(0))
 
 
-def _values(number_bytes: Bytes, type_name: str) -> Array:
+def _decoded_values(number_bytes: Bytes, type_name: str) -> Array:
     """Decode one number in all frames, and return its values, shape (n,).
 
     Half of the range is subtracted from unsigned values, so that they have the same range as signed values. The

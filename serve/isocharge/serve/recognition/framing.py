@@ -68,9 +68,9 @@ class FrameDivision(NamedTuple):
         return min(1.0, len(self.starts) * self.length / len(self.stream))
 
     def rows(self, distance: int = 0, next_bytes: int = 0) -> Bytes:
-        """Return the bytes of each frame, shape (frames, length + next_bytes).
+        """Return the bytes of the frames, shape (frames, length + next_bytes).
 
-        A frame is left out if it is too close to the end of the stream.
+        A frame is left out if its bytes and the next bytes do not all lie within the stream.
 
         Args:
             distance: Distance from `starts` to the beginnings of the frames, bytes.
@@ -103,7 +103,7 @@ def count_leading(are_true: NDArray[np.bool_]) -> int:
 
 
 def possible_divisions(chunks: Sequence[bytes], *, are_datagrams: bool) -> Iterator[Iterable[FrameDivision]]:
-    """For each kind of framing, yield all possible divisions of a stream into frames.
+    """For each kind of framing, yield all possible divisions of a stream into frames as one group.
 
     The kinds of framing are yielded from the most certain to the least certain kind. Datagrams of whole frames are the
     most certain kind, followed by frames with byte stuffing. Frames that begin at a repeated byte or pair of bytes are
@@ -157,7 +157,7 @@ def _stuffed_frames(name: Framing, stuffing: Stuffing, data: bytes) -> Iterator[
             decoded_frames.append(stuffing.decode(encoded_frame))
     length, count = _most_common_length(decoded_frames)
     has_frame_length = MIN_FRAME_BYTES <= length <= MAX_FRAME_BYTES
-    if count < INTACT_SHARE * len(encoded_frames) or not has_frame_length:
+    if count < INTACT_SHARE * len(encoded_frames) or not has_frame_length:  # most frames have no common length
         return
 
     # If the lengths are as regular without decoding, there is no stuffing, and the delimiter is a byte that only
@@ -177,7 +177,7 @@ def _most_common_length(frames: Sequence[bytes]) -> tuple[int, int]:
     return max(Counter(map(len, frames)).items(), key=itemgetter(1), default=(0, 0))
 
 
-def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDivision]:
+def _synchronised_frames(data: bytes, max_count: int = 3) -> Iterator[FrameDivision]:
     """Yield divisions of a stream into frames that begin at a repeated byte or a repeated pair of bytes.
 
     If a byte or a pair of bytes is the same in every frame, it repeats at a distance of one frame length. Frames are
@@ -187,7 +187,7 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
 
     Args:
         data: Bytes of the stream.
-        max_lengths: Largest number of divisions.
+        max_count: Largest number of divisions.
     """
     stream = np.frombuffer(data, np.uint8)
     single_bytes = stream.astype(int)
@@ -195,25 +195,27 @@ def _synchronised_frames(data: bytes, max_lengths: int = 3) -> Iterator[FrameDiv
 
     # A code is the number of a byte or of a pair. For each length of a frame, frames may begin at all positions of one
     # code at which the same code follows at the distance of this length. The code with the most such positions is
-    # chosen. If a pair and a single byte have equally many positions, the pair is chosen.
-    best_division: dict[int, FrameDivision] = {}
+    # chosen.
+    division_of_length: dict[int, FrameDivision] = {}
     for codes in (pairs, single_bytes):
         # All positions of the smallest code in ascending order, then those of the next code, and so on. The difference
         # of two adjacent positions is the distance between two occurrences of a code, unless the codes differ.
-        positions = np.argsort(codes, kind="stable")
-        has_same_code = np.diff(codes[positions]) == 0
-        distances = np.where(has_same_code, np.diff(positions), 0)
+        positions_by_code = np.argsort(codes, kind="stable")
+        has_same_code = np.diff(codes[positions_by_code]) == 0
+        distances = np.where(has_same_code, np.diff(positions_by_code), 0)
         for length in range(MIN_FRAME_BYTES, MAX_FRAME_BYTES + 1):
-            starts = positions[:-1][distances == length]  # the last position has no distance to a next one
+            starts = positions_by_code[:-1][distances == length]  # the last position has no distance to a next one
             best_code = np.bincount(codes[starts], minlength=1).argmax()  # 0 if there are no positions
             division = FrameDivision(SYNC, stream, starts[codes[starts] == best_code], length)
-            division_of_pairs = best_division.get(length, division)  # none while the pairs are examined
-            best_division[length] = max(division_of_pairs, division, key=lambda division: division.covered_share)
+            # Pairs are examined first, without an earlier division to compare with. Of equal shares, `max` returns the
+            # first division, which is that of the pair.
+            earlier_division = division_of_length.get(length, division)
+            division_of_length[length] = max(earlier_division, division, key=lambda division: division.covered_share)
 
     # The largest shares come first. They are rounded to 0.1, so that of two lengths with about equal shares the shorter
     # length comes first.
-    frequent = [division for division in best_division.values() if division.covered_share > COVERED_SHARE]
-    yield from sorted(frequent, key=lambda division: (-round(division.covered_share, 1), division.length))[:max_lengths]
+    frequent = [division for division in division_of_length.values() if division.covered_share > COVERED_SHARE]
+    yield from sorted(frequent, key=lambda division: (-round(division.covered_share, 1), division.length))[:max_count]
 
 
 ORDERS: tuple[ByteOrder, ...] = ("little", "big")
@@ -247,15 +249,15 @@ class Check(NamedTuple):
 def find_checks(rows: Bytes) -> Iterator[Check]:
     """Yield the checksums that fit the frames, from the widest to the narrowest checksum.
 
-    The checksum covers the other bytes of the frame. Constant bytes at the beginning, such as a sync pattern, need not
-    be covered. For each size and byte order, at most one checksum is yielded. If there are fewer than `MIN_FRAMES`
-    different frames, no checksum is yielded.
+    A checksum consists of the last bytes of a frame, and covers the bytes before them. Constant bytes at the beginning,
+    such as a sync pattern, need not be covered. For each size and byte order, at most one checksum is yielded. If there
+    are fewer than `MIN_FRAMES` different frames, no checksum is yielded.
 
     Args:
         rows: Bytes of the frames, shape (n, length).
     """
-    # At most 24 different frames are drawn at random. The first of the sorted frames differ in a few bits only, so that
-    # a wrong checksum could fit all of them by chance.
+    # `np.unique` sorts the different frames. The first frames differ in a few bits only, so that a wrong checksum could
+    # fit all of them by chance. At most 24 frames are therefore drawn at random.
     checked_rows = np.random.default_rng(0).permutation(np.unique(rows, axis=0))[:24]
     if len(checked_rows) < MIN_FRAMES:
         return
@@ -265,12 +267,12 @@ def find_checks(rows: Bytes) -> Iterator[Check]:
         if is_constant[-size:].all():  # a checksum would differ from frame to frame
             continue
         # The first covered byte may be each of the constant bytes at the beginning of the frame, or the first byte that
-        # is not constant. A checksum covers at least two bytes.
-        last_start = min(count_leading(is_constant), len(is_constant) - size - 2)
+        # is not constant. A checksum covers at least two bytes, which stand before its own `size` bytes.
+        last_possible_start = min(count_leading(is_constant), len(is_constant) - size - 2)
         names = [name for name, checksum in CHECKSUMS.items() if checksum.size == size]
         orders = ORDERS if size > 1 else ORDERS[:1]  # a single byte has no byte order
         for order in orders:
-            candidates = (Check(name, order, start) for start in range(last_start + 1) for name in names)
+            candidates = (Check(name, order, start) for start in range(last_possible_start + 1) for name in names)
             check = next((candidate for candidate in candidates if _fits(candidate, frames)), None)
             if check is not None:
                 yield check

@@ -58,14 +58,16 @@ def described_frames_section(
         seconds: Time in which the bytes arrived, s. The unit of a clock is derived from this time.
         are_datagrams: Whether each chunk is a datagram.
     """
-    # If only the first bytes are examined, they have arrived in a part of the time.
+    # Only the first `MAX_EXAMINED_BYTES` bytes are examined. They have arrived in this part of the time.
     byte_count = sum(map(len, chunks))
     examined_seconds = seconds * min(1.0, MAX_EXAMINED_BYTES / max(1, byte_count))
-    for divisions in possible_divisions(chunks, are_datagrams=are_datagrams):
-        scored_layouts = (_scored_layouts(division, examined_seconds) for division in divisions)
+    # A division states where the frames begin. Each kind of framing has a group of possible divisions.
+    for divisions_of_framing in possible_divisions(chunks, are_datagrams=are_datagrams):
+        scored_layouts = (_scored_layouts(division, examined_seconds) for division in divisions_of_framing)
+        # Each element is a score and a description. The lowest score is the best.
         best = min(chain.from_iterable(scored_layouts), key=itemgetter(0), default=None)
         if best is not None:
-            section: dict[str, Any] = to_builtins(best[1])
+            section: dict[str, Any] = to_builtins(best[1])  # the description as a dictionary
             return section
     return None
 
@@ -168,7 +170,7 @@ def _fields(parts: Sequence[Part]) -> tuple[Field, ...]:
         else:
             padding_size = part.size
             if fields and fields[-1].type_name == PADDING:  # join the padding with that before it
-                padding_size += fields.pop().count
+                padding_size += fields.pop().count  # removes the padding before it
             fields.append(Field(type_name=PADDING, count=padding_size))
     return tuple(fields)
 
@@ -195,14 +197,14 @@ def recognise(chunks: Sequence[bytes], seconds: float, *, are_datagrams: bool = 
     frames = [frame for frame in all_frames if len(frame.values) == len(all_frames[-1].values)]
     section: dict[str, Any] | None = None
     if len(frames) >= MIN_FRAMES:
-        section = {"format": "binary"}
+        section = {"format": "binary"}  # unless the parser has recognised text
         text_parser = parser.recognised
         if isinstance(text_parser, TextParser) and text_parser.layout is not None:
             frame_rate_Hz = len(all_frames) / seconds
             section = {"format": "text"} | _text_keys(text_parser.layout, frames, frame_rate_Hz)
-    is_covered = parser.counts.bytes_dropped <= (1.0 - COVERED_SHARE) * len(data)
-    if _is_text(data) or (section and is_covered):
-        return section
+    has_enough_frame_bytes = parser.counts.bytes_dropped <= (1.0 - COVERED_SHARE) * len(data)
+    if _is_text(data) or (section and has_enough_frame_bytes):
+        return section  # None for text in which no frames were recognised
 
     # The parser has found no frames, or has dropped most of the bytes. The board may send other frames, of which a few
     # resemble text or frames of isocharge. If no other frames are recognised either, the result of the parser is used.
@@ -235,23 +237,25 @@ def _text_keys(layout: Layout, frames: Sequence[Frame], frame_rate_Hz: float) ->
         frames: Frames in the lines. All frames have the same number of values.
         frame_rate_Hz: Number of frames per second, Hz.
     """
-    names = list(layout.names)
-    keys: dict[str, Any] = {}
+    # A column is the index of a value among all values of a frame. `unnamed` lists the columns without a name in the
+    # lines. The name of a counter or a clock is replaced by its meaning, such as `seq`.
+    resolved_names = list(layout.names)
+    device_keys: dict[str, Any] = {}
     steps = np.diff([frame.values for frame in frames], axis=0)  # shape (n - 1, channels)
     for (column, _scale), channel_steps in zip(layout.columns.channels, steps.T, strict=True):
-        name = names[column]
-        meaning = _counter_or_clock(name, channel_steps, frame_rate_Hz, names)
+        name = resolved_names[column]
+        meaning = _counter_or_clock(name, channel_steps, frame_rate_Hz, resolved_names)
         if meaning:
-            names[column] = meaning
+            resolved_names[column] = meaning
             if column not in layout.unnamed:  # the board sends a name with each value
-                keys[meaning] = name
+                device_keys[meaning] = name  # the name that the board uses for its counter or clock
 
     # For the values without a name in each line, list the names from a header, and the names of the counter and the
     # clock. Other channels are numbered. If none of these names is known, the columns need no names.
-    if any(names[column] for column in layout.unnamed):
+    if any(resolved_names[column] for column in layout.unnamed):
         channel_numbers = count(1)
-        keys["columns"] = [names[column] or f"ch{next(channel_numbers)}" for column in layout.unnamed]
-    return keys
+        device_keys["columns"] = [resolved_names[column] or f"ch{next(channel_numbers)}" for column in layout.unnamed]
+    return device_keys
 
 
 def _counter_or_clock(name: str, steps: Array, frame_rate_Hz: float, known_names: Sequence[str]) -> str:
@@ -260,7 +264,7 @@ def _counter_or_clock(name: str, steps: Array, frame_rate_Hz: float, known_names
     A counter increases by 1 from frame to frame, and a clock increases at one of the usual rates. If one column
     contains the seconds of a time and another column the milliseconds, the milliseconds are no clock, because they
     return to 0 every second. A clock in ms that increases by about 1 could also be a counter. Such a clock is
-    recognised by its name, or by values that occur twice.
+    recognised by its name, or by values that occur twice, which `possible_meanings` finds.
 
     Args:
         name: Name of the column; empty if the board sends no name.
@@ -268,12 +272,14 @@ def _counter_or_clock(name: str, steps: Array, frame_rate_Hz: float, known_names
         frame_rate_Hz: Number of frames per second, Hz.
         known_names: Names of all columns. If they contain a counter or a clock, the column is not a second one.
     """
-    meanings = list(possible_meanings(steps, frame_rate_Hz))  # the counter comes before a clock
-    if any(word in name.lower() for word in ("ms", "milli", "time")):
-        meanings = meanings[-1:]  # do not take the column for a counter if it may be a clock
+    # Pairs of a meaning, such as `seq` or `t_ms`, and the duration of one tick in the unit of this meaning. In one tick,
+    # the value increases by 1. The counter comes before a clock.
+    possible = list(possible_meanings(steps, frame_rate_Hz))
+    if any(word in name.lower() for word in ("ms", "milli", "time")):  # the column has the name of a clock
+        possible = possible[-1:]  # do not take the column for a counter if it may be a clock
     has_counter = SEQ in known_names
     has_clock = not TIMES_US.keys().isdisjoint(known_names)
-    for meaning, tick in meanings:
+    for meaning, tick in possible:
         if meaning == SEQ and not has_counter:
             return meaning
         # The ticks of a clock must be those of the name, because a device file for lines of text cannot state their
