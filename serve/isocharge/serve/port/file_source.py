@@ -62,17 +62,17 @@ def check_bytes(name: str, head: bytes) -> None:
     Raises:
         InputError: If the file is of another kind. The message states the kind, and how to use such a file.
     """
-    kind = foreign_kind(name, head)
+    kind_and_advice = foreign_kind(name, head)
     if head.startswith(RECORDING_START):
-        kind = f"got a recording; play it with: isocharge serve replay {shlex.quote(name)}"
-    if kind:
-        raise InputError(f"{name}: expected a port, or a file of bytes from a board, {kind}")
+        kind_and_advice = f"got a recording; play it with: isocharge serve replay {shlex.quote(name)}"
+    if kind_and_advice:
+        raise InputError(f"{name}: expected a port, or a file of bytes from a board, {kind_and_advice}")
 
 
 def foreign_kind(name: str, head: bytes) -> str:
     """Return the kind of a file that is not from a board, with advice; empty for recordings and bytes of a board.
 
-    The text continues a sentence that states what was expected, as in "got an MCAP file; ...".
+    The text is the end of an error message that states what was expected, as in "got an MCAP file; ...".
 
     Lines of text with the column names of a table of presses are only accepted from the standard input.
 
@@ -130,7 +130,7 @@ class FileSource:
             check_bytes(name, os.pread(descriptor, HEAD_BYTES, 0))
 
     def __iter__(self) -> Iterator[Chunk]:
-        """Yield chunks until the file ends.
+        """Yield chunks of at most `HEAD_BYTES` until the file ends.
 
         All chunks of a file on a disk have the same arrival time, at which reading began. The arrival time of a chunk
         of a pipe is the time at which the chunk was read.
@@ -143,7 +143,7 @@ class FileSource:
         check_bytes(self._name, data)
         while data:
             arrival_s = start_s if self.is_on_disk else time.time()
-            yield Chunk(data, arrival_s, time.perf_counter_ns())
+            yield Chunk(data, arrival_s, time.perf_counter_ns())  # the last time is monotonic
             data = os.read(self._descriptor, HEAD_BYTES)
 
 

@@ -112,8 +112,8 @@ class Recorder:
     def write(self, lines: str) -> None:
         """Append complete lines to the file.
 
-        If an interrupted call has left an incomplete line, the new lines overwrite this line. If the disk is full, an
-        error is logged, and all later calls write nothing.
+        If an earlier call was interrupted, for example by Ctrl-C, and has left an incomplete line, the new lines
+        overwrite this line. If the disk is full, an error is logged, and all later calls write nothing.
 
         Args:
             lines: One or more lines, such as a record in JSON, without the line feed after the last line.
@@ -121,6 +121,8 @@ class Recorder:
         if self.failed:
             return
         try:
+            # The `AtomicWriter` writes behind the latest complete line. If it raises an error, it has removed the bytes
+            # of the incomplete line.
             self._file.write(f"{lines}\n".encode())
         except OSError as error:
             self.failed = True
@@ -166,15 +168,18 @@ class Recording:
         Raises:
             RecordingError: If the file cannot be read, or is not a recording of this version.
         """
-        self._path = path = Path(path)
+        self._path = path = Path(path)  # kept, because the other methods read the file again
         first_line = b""
         try:
-            if not path.is_file():  # the file is opened twice, but a pipe can be read only once
+            # A pipe is refused, because it can be read only once, and the other methods open the file again. The error
+            # becomes the reason in the error below, as all other errors do.
+            if not path.is_file():
                 raise RecordingError("there is no regular file of that name")
             with path.open("rb") as file:
                 first_line = file.readline(MAX_LINE_CHARACTERS)  # empty if the file is empty
             header = parse_json(first_line.decode("utf-8", "replace"), "first line", RecordingError, _Header)
         except (OSError, ValueError) as error:  # RecordingError is a ValueError
+            # A file of another known kind, such as a table, is named. For all other files, the reason is the error.
             reason = foreign_kind(str(path), first_line) or cut(str(error))
             raise RecordingError(f"{path}: expected a recording of `serve stream --record` ({reason})") from error
         if header.isocharge_recording != VERSION:
@@ -184,7 +189,7 @@ class Recording:
             )
         self.model = header.model
         self.device = header.device
-        self.name = header.name
+        self.name = header.name  # name of the film in the records
 
     def events(self) -> Iterator[Event]:
         """Yield all lines of the recording after the first line in their order.
@@ -228,7 +233,7 @@ class Recording:
                         return
                     is_header = line_number == 1
                     is_damaged = not line.startswith("{")
-                    is_selected = line.startswith(beginning) or is_damaged
+                    is_selected = line.startswith(beginning) or is_damaged  # to parse a damaged line raises an error
                     if is_selected and not is_header:
                         yield parse_json(line, "", RecordingError, line_type)
                     line_number += 1

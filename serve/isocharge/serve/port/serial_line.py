@@ -107,7 +107,7 @@ class SerialLine:
         if self._descriptor is not None and os.isatty(self._descriptor):
             attributes = termios.tcgetattr(self._descriptor)
             control_modes = 2  # index in the attributes
-            attributes[control_modes] &= ~termios.HUPCL
+            attributes[control_modes] &= ~termios.HUPCL  # switches off "hang up on close"
             termios.tcsetattr(self._descriptor, termios.TCSANOW, attributes)
 
     def write(self, data: bytes) -> None:
@@ -137,6 +137,7 @@ class SerialLine:
         data = b""
         try:
             while len(data) < MAX_READ_BYTES:  # a terminal returns at most 4 kB at a time
+                # Wait only for the first bytes.
                 readable, _, _ = select.select([self._descriptor], [], [], 0.0 if data else timeout_s)
                 if not readable:
                     break
@@ -182,8 +183,8 @@ class Requester:
         """
         self._line = line
         self._request = request
-        self._earliest_s = 0.0  # time at which the limit of the rate allows the next request
-        self._due_s = 0.0  # time at which the next request is due
+        self._earliest_request_s = 0.0  # time before which the limit of the rate allows no further request
+        self._next_request_s = 0.0  # time at which the next request is due; not before the time above
         self._expects_echo = False  # whether the next bytes may be an echo of the request
         self._kept_bytes = b""  # first bytes after the request, which may be the beginning of its echo
 
@@ -202,7 +203,7 @@ class Requester:
         deadline_s = time.monotonic() + timeout_s
         while (remaining_s := deadline_s - time.monotonic()) > 0.0:
             if self.wait_s() == 0.0:
-                self._line.write(self.next_request())
+                self._line.write(self.next_request())  # the following request is then due later
             # Wait for bytes, at most until the next request is due or the timeout has passed.
             received = self._line.receive(min(self.wait_s(), remaining_s))
             answer = self.remove_echo(received)
@@ -220,17 +221,17 @@ class Requester:
         At least 1 / `rate_Hz` must pass between two requests. If a request receives no answer, `REPEAT_TIME_s` must
         pass, too. If an answer arrives, `QUIET_TIME_s` must pass after its latest byte.
         """
-        return max(0.0, self._due_s - time.monotonic())
+        return max(0.0, self._next_request_s - time.monotonic())
 
     def next_request(self) -> bytes:
-        """Return the bytes of the next request, which the caller must send now.
+        """Return the bytes of the next request, which the caller must send now, and begin to wait for the answer.
 
         If the board does not answer, the request is due again after `REPEAT_TIME_s`, but not earlier than the limit of
         the rate allows.
         """
         now_s = time.monotonic()
-        self._earliest_s = now_s + 1.0 / self._request.rate_Hz
-        self._due_s = max(self._earliest_s, now_s + REPEAT_TIME_s)
+        self._earliest_request_s = now_s + 1.0 / self._request.rate_Hz
+        self._next_request_s = max(self._earliest_request_s, now_s + REPEAT_TIME_s)
         self._expects_echo = True
         self._kept_bytes = b""
         return self._request.data
@@ -239,7 +240,9 @@ class Requester:
         """Return the received bytes without the echo of the request.
 
         The echo consists of the same bytes as the request, and may arrive in several parts. Bytes that may be the
-        beginning of an echo are kept back. If later bytes differ from the request, the kept bytes are returned, too.
+        beginning of an echo are kept back. If later bytes differ from the request, the kept bytes are returned, too. If
+        bytes are returned, the next request is due when the board has been quiet for `QUIET_TIME_s`, but not earlier
+        than the limit of the rate allows.
 
         Args:
             received: Bytes that arrived after the latest request; may be empty.
@@ -250,9 +253,10 @@ class Requester:
             if request != self._kept_bytes and request.startswith(self._kept_bytes):  # an incomplete echo
                 return b""
             self._expects_echo = False
+            # Nothing is removed if the board sends no echo. The next request clears the kept bytes.
             received = self._kept_bytes.removeprefix(request)
         if received:
-            self._due_s = max(self._earliest_s, time.monotonic() + QUIET_TIME_s)
+            self._next_request_s = max(self._earliest_request_s, time.monotonic() + QUIET_TIME_s)
         return received
 
 
@@ -292,7 +296,7 @@ class UdpSocket:
         except OSError:
             self._socket.close()
             raise
-        self._board_ends_lines = False  # whether the board ends its lines, although a line may need several datagrams
+        self._board_ends_lines = False  # whether the board itself ends each line, perhaps after several datagrams
         self._datagrams_without_end = 0  # number of successive datagrams without a line feed
         self._is_text = False  # whether the latest datagram is text, which is valid UTF-8 without control characters
         self._senders: list[tuple[Any, ...]] = []  # host and port of the first two senders of datagrams
@@ -314,7 +318,8 @@ class UdpSocket:
     def _receive_datagram(self, timeout_s: float) -> bytes:
         """Wait for a datagram that is not empty, and return it. A second sender causes one warning.
 
-        If the datagram is text and the board sends no line feeds, a line feed is added at the end.
+        The attribute `_is_text` then states whether the datagram is text, which is UTF-8 without control characters. If
+        it is text and the board sends no line feeds, a line feed is added at the end.
 
         Args:
             timeout_s: Longest time to wait, s.
@@ -333,8 +338,8 @@ class UdpSocket:
                         *self._senders,
                     )
             if data:
-                # Decoding replaces invalid bytes. A program in C may send the zero byte at the end of its text.
-                is_utf8 = data.decode("utf-8", "replace").encode() == data
+                is_utf8 = data.decode("utf-8", "replace").encode() == data  # decoding replaces invalid bytes
+                # A program in C may send the zero byte at the end of its text.
                 self._is_text = is_utf8 and _CONTROL_CHARACTER.search(data.removesuffix(b"\0")) is None
                 return self._with_line_feed(data)
         return b""

@@ -110,7 +110,7 @@ class Port:
         self._request = request
         self._wait = wait
         self.start_up_s = max(wait, silence_s, START_UP_s)
-        self._max_silence_s = self.start_up_s  # longest wait for the next byte
+        self._max_silence_s = self.start_up_s  # longest wait for the next byte; shorter after the board has started
         self._line: SerialLine | UdpSocket | Requester | None = None
 
     def __enter__(self) -> Self:
@@ -165,7 +165,7 @@ class Port:
                     "Linux, the group 'dialout')"
                 )
             raise PortError(f"{self.url}: cannot be opened{speed} ({error}); {hint}") from error
-        self._max_silence_s = self.start_up_s
+        self._max_silence_s = self.start_up_s  # the opening may have restarted the board, which then starts slowly
 
     def __exit__(self, *_: object) -> None:
         """Close the port when the context is left."""
@@ -188,7 +188,7 @@ class Port:
             PortLost: If the port disappears or stays silent for too long, and `reconnect` is false.
             PortError: If the port is not open.
         """
-        full_chunk_count = 0  # number of chunks of the largest size in succession; remains 2 after the warning
+        full_chunk_count = 0  # number of successive chunks of the largest size; stays 2 after the only warning
         while True:
             wait_start_s = time.monotonic()
             try:
@@ -204,7 +204,7 @@ class Port:
                     raise
                 log.warning("%s; trying again until it is back", error)
                 chunk = self._read_after_reconnecting()._replace(outage_s=time.monotonic() - wait_start_s)
-            self._max_silence_s = self._silence_s  # the board has started
+            self._max_silence_s = self._silence_s  # the board has started, so that it must send more often
             if full_chunk_count < 2:
                 full_chunk_count = full_chunk_count + 1 if len(chunk.data) >= MAX_READ_BYTES else 0
                 if full_chunk_count == 2:
@@ -232,7 +232,7 @@ class Port:
             raise PortError(f"{self.url}: the port is not open; use `with Port(...) as port`")
         try:
             data = self._line.receive(timeout_s)
-        except BlockingIOError as error:
+        except BlockingIOError as error:  # bytes had arrived, but another program has read them
             raise PortLost(
                 f"{self.url}: another program reads this port, too, and takes some of its bytes; end that program (on "
                 f"Linux, `fuser {self.url}` shows its number)"
@@ -257,7 +257,7 @@ class Port:
             with contextlib.suppress(PortError):  # also PortLost
                 self._open()
                 pause_s = min(2.0 * pause_s, self.start_up_s)
-                chunk = self.read(self.start_up_s)
+                chunk = self.read(self.start_up_s)  # None if the board sends nothing
         return chunk
 
 
@@ -303,9 +303,10 @@ class AddedSource(contextlib.ExitStack):
             PluginError: If the package cannot be imported, or returns no source.
         """
         super().__init__()
+        # Each call returns a new context, which states the entry point in all errors.
         self._named_errors = partial(plugin_errors, url, f"source {entry_point.value}")
         with self._named_errors():
-            self._source = self.enter_context(entry_point.load()(url))
+            self._source = self.enter_context(entry_point.load()(url))  # loads the function, and calls it
             self.is_live = self._source.is_live
 
     def __iter__(self) -> Iterator[Chunk]:
@@ -340,7 +341,7 @@ def open_source(url: str, *, wait: float = 0.0, **port_settings: Any) -> context
     scheme, separator, _address = url.partition("://")
     is_path = not separator
     if not is_path:
-        # If another package has added a source for the scheme, the first such source is used.
+        # If other packages have added sources for the scheme, the first source is used. Without one, the loop is empty.
         for entry_point in entry_points(group=ENTRY_POINTS, name=scheme):
             return AddedSource(entry_point, url)
 
