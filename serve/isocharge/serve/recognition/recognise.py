@@ -272,8 +272,8 @@ def _counter_or_clock(name: str, steps: Array, frame_rate_Hz: float, known_names
         frame_rate_Hz: Number of frames per second, Hz.
         known_names: Names of all columns. If they contain a counter or a clock, the column is not a second one.
     """
-    # Pairs of a meaning, such as `seq` or `t_ms`, and the duration of one tick in the unit of this meaning. In one tick,
-    # the value increases by 1. The counter comes before a clock.
+    # Pairs of a meaning, such as `seq` or `t_ms`, and the duration of one tick in the unit of this meaning. The value
+    # increases by 1 in each tick. The counter comes before a clock.
     possible = list(possible_meanings(steps, frame_rate_Hz))
     if any(word in name.lower() for word in ("ms", "milli", "time")):  # the column has the name of a clock
         possible = possible[-1:]  # do not take the column for a counter if it may be a clock
