@@ -155,4 +155,4 @@ def test_predictor_can_be_copied_and_pickled(film, predictor, copied, tmp_path, 
     monkeypatch.chdir(tmp_path)
     other = copied(relative)
     assert other.predict(charges) == predictor.predict(charges)
-    assert other._press is not predictor._press
+    assert other._single_inference is not predictor._single_inference

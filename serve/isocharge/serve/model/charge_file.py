@@ -45,7 +45,11 @@ NUMBERS = ("charge_std", "offset_pC", "pretension_MPa", "tension_std_MPa")
 
 
 def charge_map_bytes(series: ChargeSeries) -> bytes:
-    """Return the content of the file `charges.npz` for a charge map."""
+    """Return the content of the file `charges.npz` for a charge map, which is a Chebyshev series in the contact.
+
+    The arrays of coefficients with many elements are stored in single precision. `NUMBERS` contains the names of the
+    attributes that are one number, or one number for each electrode, such as "charge_std".
+    """
     arrays: dict[str, Any] = {
         "format": FORMAT,
         "series": series.coefficients.astype(np.float32),
@@ -56,7 +60,7 @@ def charge_map_bytes(series: ChargeSeries) -> bytes:
         "is_folded": int(series.is_folded),
     }
     arrays |= {name: getattr(series, name) for name in NUMBERS}
-    if series.log_size is not None:
+    if series.log_size is not None:  # coefficients of the logarithm of the typical charge; None if all are positive
         arrays["log_size"] = series.log_size
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)
@@ -67,6 +71,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
     """Read the charge map in the file `charges.npz` of a model. Return None if the model has no such file.
 
     The numbers are not checked. When a model is loaded, the file is compared with its checksum in `golden.json`.
+    `NUMBERS` contains the names of the attributes that are one number, or one number for each electrode.
 
     Args:
         version_folder: Folder of the model, which contains `model.onnx`.
@@ -82,7 +87,7 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
     data = read_needed(path, ModelError, ADVICE)
     try:
         arrays: dict[str, Any] = npz_arrays(data)
-        file_format = arrays.get("format", 1)
+        file_format = arrays.get("format", 1)  # files of the first version contain no version
         if file_format != FORMAT:
             raise ValueError(f"format {file_format} is not supported (this version reads {FORMAT})")
         coefficients = arrays["series"]
@@ -93,8 +98,8 @@ def read_charge_map(version_folder: Path, electrodes: tuple[str, ...]) -> Charge
             electrodes=electrodes,
             coefficients=coefficients.astype(float),
             node_MPa=arrays["node_MPa"],
-            directions=arrays.get("directions", NO_DIRECTIONS).astype(float),
-            log_size=arrays.get("log_size"),
+            directions=arrays.get("directions", NO_DIRECTIONS).astype(float),  # by default, an array without directions
+            log_size=arrays.get("log_size"),  # None if all charges are positive
             is_folded=bool(arrays["is_folded"]),
             **{name: arrays[name][()] for name in NUMBERS},  # a number instead of an array of shape ()
         )

@@ -56,18 +56,21 @@ class Series:
     coefficients: Array
 
     def values_and_derivatives(self, coordinates: Array, excess: Array) -> Array:
-        """Evaluate the series and its derivatives with respect to the coordinates, and continue the series linearly.
+        """Evaluate the series and its derivatives with respect to the coordinates, and extrapolate the values linearly.
 
         The points are processed in chunks of at most `CHUNK_SIZE` points. In each chunk, the method first sums over the
-        polynomials in x and y, and then over the polynomials in the logarithm of the force.
+        n_term products of a polynomial in x and a polynomial in y, and then over the n_force polynomials in the
+        logarithm of the force.
 
         Args:
-            coordinates: Scaled coordinates of n points, shape (n, 3). Coordinates outside [-1, 1] are clipped.
-            excess: Steps from these points to the points to which the series is continued, shape (n, 3).
+            coordinates: Scaled coordinates (x, y, logarithm of the force) of n points, shape (n, 3). Coordinates
+                outside the range from -1 to 1 are clipped.
+            excess: Steps from these points to the given points, which may lie outside the range, shape (n, 3). The
+                value at a given point is extrapolated along the tangent at the clipped point.
 
         Returns:
-            Values at the continued points, and derivatives, shape (n, 4, n_electrode). The second axis contains the
-            value and the derivatives with respect to x, y and the logarithm of the force.
+            Values and derivatives, shape (n, 4, n_electrode). The second axis contains the value at the given point,
+            and the derivatives at the clipped point with respect to x, y and the logarithm of the force.
         """
         n_x, _n_y, n_force, n_electrode = self.coefficients.shape  # numbers of polynomials, and of electrodes
         n_chunk = len(coordinates) // CHUNK_SIZE + 1  # at least one chunk, even if there are no points
@@ -88,7 +91,7 @@ class Series:
             evaluated_chunks.append(chunk_values[:, 0, :])
         values = np.concatenate(evaluated_chunks).reshape(len(coordinates), 4, n_electrode)
         if excess.any():  # add the sum of excess times derivative over the three coordinates (index s)
-            values[:, 0] += np.einsum("ns,nsk->nk", excess, values[:, 1:])
+            values[:, 0] += np.einsum("ns,nse->ne", excess, values[:, 1:])
         return values
 
     @cached_property
@@ -96,14 +99,16 @@ class Series:
         """Coefficients of the series and of its derivatives with respect to x, y and the logarithm of the force.
 
         The shape is (n_term, (force_degree + 1) * 4 * n_electrode). Each row belongs to one product of a polynomial in
-        x and a polynomial in y, in the order of `position_degrees`.
+        x and a polynomial in y, in the order of `position_degrees`. In a row, the degree in the logarithm of the force
+        changes slowest. Then follow the four series (the value and its derivatives) and, as the fastest, the electrode.
         """
         derivatives = [_derivative(self.coefficients, axis) for axis in range(3)]
         series_and_derivatives = np.stack([self.coefficients, *derivatives])
         degree = self.coefficients.shape[0] - 1
         x_degree, y_degree = position_degrees(degree)  # degrees in x and y of each product, shape (n_term,)
 
-        coefficients = series_and_derivatives[:, x_degree, y_degree]  # (4, n_term, force_degree + 1, n_electrode)
+        # Select the coefficients of each product. The shape is (4, n_term, force_degree + 1, n_electrode).
+        coefficients = series_and_derivatives[:, x_degree, y_degree]
         coefficients_by_term = coefficients.transpose(1, 2, 0, 3)  # shape (n_term, force_degree + 1, 4, n_electrode)
         return coefficients_by_term.reshape(len(x_degree), -1)
 
@@ -139,7 +144,7 @@ def chebyshev_terms(coordinates: Array, degree: int, force_degree: int) -> tuple
     polynomials = chebyshev.chebvander(np.clip(coordinates, -1.0, 1.0).T, max(degree, force_degree))
     x_polynomials, y_polynomials, force_polynomials = polynomials  # each of shape (n, largest degree + 1)
 
-    x_degree, y_degree = position_degrees(degree)
+    x_degree, y_degree = position_degrees(degree)  # degrees in x and in y of each product, shape (n_term,)
     position_terms = x_polynomials[:, x_degree] * y_polynomials[:, y_degree]
     return position_terms, force_polynomials[:, : force_degree + 1]
 
@@ -234,20 +239,22 @@ class ChargeSeries:
         """
         nearest, excess = self._nearest_in_domain(contact)
         values = self._calibrated.values_and_derivatives(nearest, excess)
-        charge_pC, _, by_contact = self._charges(values, nearest, excess)
+        charge_pC, _, by_contact = self._charges_from_values(values, nearest, excess)
         return charge_pC + self.offset_pC, by_contact
 
     def in_state(self, contact: Array, state: Array) -> ModelValues:
         """Compute the charges of contacts for any state of the film, and the derivatives of the charges.
 
-        The symbols are defined at the beginning of this module. The value v is interpolated between its values at the
-        nodes of the pretension. The change along each direction k then adds z_k (d_k + t d'_k) to v. The charges follow
-        from v.
+        For each electrode, the map contains a value v: the logarithm of the charge or, if some charges are not
+        positive, the charge divided by its typical size. t is the change of the mean pretension since the calibration.
+        v is interpolated between its values at some values of t, which are called nodes. The film may also change along
+        K directions. A change z_k along direction k adds z_k (d_k + t d'_k) to v. The map contains d_k and d'_k as
+        further series. The charges follow from v.
 
         Args:
             contact: Contacts (x, y, F), shape (n, 3), mm and N.
             state: State (t, z_1, ..., z_K) of the film, shape (1 + K,), or one state for each contact, shape
-                (n, 1 + K), MPa and standard deviations.
+                (n, 1 + K). The unit of t is MPa. z_k is in standard deviations.
 
         Returns:
             Charges, and their derivatives with respect to (x, y, ln F) and with respect to the state.
@@ -257,7 +264,7 @@ class ChargeSeries:
         nearest, excess = self._nearest_in_domain(contact)  # contacts outside the domain are extrapolated by the excess
         states = np.broadcast_to(state, (n_contact, 1 + self.direction_count))
         pretension = states[:, 0]  # t of each contact, shape (n,)
-        directions = states[:, 1:]  # z_1 to z_K of each contact, shape (n, K)
+        shifts = states[:, 1:]  # z_1 to z_K of each contact, shape (n, K)
 
         # Evaluate v at the nodes, and d and d' of each direction. The axis of length 4 contains the value and its
         # derivatives with respect to the three coordinates of the contact.
@@ -268,19 +275,20 @@ class ChargeSeries:
         change_per_MPa = direction_values[:, :, 1]  # d', of the same shape
         total_change = change + pretension[:, None, None, None] * change_per_MPa  # d + t d'
 
-        # Interpolate between the nodes (index k), and add the changes by the directions (index d). The other indices
-        # are the press (n), the value or one of its derivatives (s) and the electrode (e).
+        # Interpolate between the nodes (index m), and add the changes by the directions (index k). The other indices
+        # are the contact (n), the value or one of its derivatives (s) and the electrode (e).
         weights, weight_slopes = interpolation_weights(self.node_MPa, pretension)  # each of shape (n, n_node)
-        value = np.einsum("nk,nske->nse", weights, node_values) + np.einsum("nd,nsde->nse", directions, total_change)
+        value = np.einsum("nm,nsme->nse", weights, node_values) + np.einsum("nk,nske->nse", shifts, total_change)
 
         # Derivatives of v with respect to t, and to z of each direction
-        value_per_MPa = np.einsum("nk,nke->ne", weight_slopes, node_values[:, 0])
-        value_per_MPa += np.einsum("nd,nde->ne", directions, change_per_MPa[:, 0])
+        value_per_MPa = np.einsum("nm,nme->ne", weight_slopes, node_values[:, 0])
+        value_per_MPa += np.einsum("nk,nke->ne", shifts, change_per_MPa[:, 0])
         value_per_direction = total_change[:, 0].swapaxes(0, 1)  # shape (K, n, n_electrode)
         value_per_state = np.stack([value_per_MPa, *value_per_direction], axis=2)
 
-        # Convert v to charges, and apply the chain rule to the derivatives with respect to the state.
-        charge_pC, charge_per_value, by_contact = self._charges(value, nearest, excess)
+        # Convert v to charges, and apply the chain rule to the derivatives with respect to the state. `by_contact` are
+        # the derivatives of the charges with respect to (x, y, ln F).
+        charge_pC, charge_per_value, by_contact = self._charges_from_values(value, nearest, excess)
         by_state = charge_per_value[:, :, None] * value_per_state  # shape (n, n_electrode, 1 + K)
         return ModelValues(charge_pC + self.offset_pC, by_contact, by_state)
 
@@ -314,32 +322,37 @@ class ChargeSeries:
         nearest = into_unit_domain(unit_contact)
         return nearest, unit_contact - nearest
 
-    def _charges(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array, Array]:
-        """Convert values v of the series into charges without the offset.
+    def _charges_from_values(self, value: Array, nearest: Array, excess: Array) -> tuple[Array, Array, Array]:
+        """Convert values v of the series into charges Q without the offset.
 
-        If all charges are positive, v is the logarithm of the charge. If some charges are not positive, v is the charge
-        divided by S(l). Here, S is the typical size of the charges, and l is the scaled logarithm of the force.
+        If all charges are positive, v is ln Q. If some charges are not positive, v is Q / S(l). Here, S is the typical
+        size of the charges, and l is the logarithm of the force in unit coordinates. The unit coordinates (x, y, l) are
+        scaled to [-1, 1] in the domain of the map.
 
         Args:
             value: v and its derivatives with respect to the unit coordinates, shape (n, 4, n_electrode).
-            nearest: Nearest contacts in the domain, as `_nearest_in_domain` returns them.
-            excess: Steps from the nearest contacts to the given contacts, as `_nearest_in_domain` returns them.
+            nearest: Unit coordinates (x, y, l) of the contacts in the domain that are nearest to the given contacts,
+                shape (n, 3).
+            excess: Unit coordinates of the given contacts minus `nearest`, shape (n, 3). ln S is extrapolated linearly.
 
         Returns:
             Charges without the offset, and their derivatives with respect to v, both of shape (n, n_electrode), pC.
-            Derivatives of the charges with respect to the contact, as `linearised` returns them.
+            Derivatives of the charges with respect to (x, y, ln F), where F is the force, shape (n, n_electrode, 3),
+            pC/mm, pC/mm and pC.
         """
         slopes = value[:, 1:].swapaxes(1, 2)  # shape (n, n_electrode, 3)
-        if self.log_size is None:  # Q = exp(v), so the derivative with respect to v is Q, too
+        if self.log_size is None:  # all charges are positive; Q = exp(v), so the derivative with respect to v is Q, too
             charge_pC = _limited_exp(value[:, 0])
             charge_per_value = charge_pC
             by_unit_contact = charge_pC[:, :, None] * slopes
-        else:  # Q = S(l) v, so the derivative with respect to l is S (v' + (ln S)' v)
-            size_pC, log_size_slope = series_size(self.log_size, nearest[:, 2], excess[:, 2])
+        else:  # Q = S(l) v; `log_size` contains the coefficients of ln S
+            size_pC, log_size_slope = series_size(self.log_size, nearest[:, 2], excess[:, 2])  # S and (ln S)'
             charge_pC = size_pC * value[:, 0]
             charge_per_value = np.broadcast_to(size_pC, charge_pC.shape)
             by_unit_contact = size_pC[:, :, None] * slopes
+            # S depends on l. By the product rule, dQ/dl = S v' + S' v = S v' + (ln S)' Q.
             by_unit_contact[:, :, 2] += log_size_slope * charge_pC
+        # `scale` contains the sizes of the units of x (mm), y (mm) and ln F.
         return charge_pC, charge_per_value, by_unit_contact / self.domain.scale
 
 
@@ -376,7 +389,8 @@ def interpolation_weights(nodes: Array, points: Array) -> tuple[Array, Array]:
         Weights of the values at the nodes, and the derivatives of the weights with respect to the points, each of shape
         (n, n_node).
     """
-    scale = max(np.abs(nodes).max(), 1e-12)  # of all powers, so that the matrix is well conditioned
+    # The nodes are divided by the largest of them. The matrix of their powers is then well conditioned.
+    scale = max(np.abs(nodes).max(), 1e-12)
     # Each column contains the coefficients of the polynomial that is 1 at one node, and 0 at the others.
     node_polynomials = np.linalg.inv(polynomial.polyvander(nodes / scale, nodes.size - 1))
     weights = polynomial.polyval(points / scale, node_polynomials)

@@ -181,7 +181,7 @@ def write_finite(write: Callable[..., object], values: Any) -> bool:
 
     Args:
         write: Function that takes the numbers as separate arguments and raises the exceptions of `struct.pack_into`.
-        values: The numbers, as many as `write` takes.
+        values: Iterable of the numbers, as many as `write` takes. Values of other types give False.
 
     Returns:
         True if all numbers were written and are finite. If False, the memory does not contain valid charges.
@@ -189,8 +189,8 @@ def write_finite(write: Callable[..., object], values: Any) -> bool:
     try:
         numbers = tuple(values)
         write(*numbers)
-        # The sum is not finite if a number is NaN or infinite. Otherwise, the sum is finite, because `write` has
-        # refused numbers beyond the range of float32, and their sum is computed in float64.
+        # If a number is NaN or infinite, the sum is not finite. A sum of finite numbers is finite here: `write` has
+        # refused numbers beyond the range of float32, and the sum is computed in float64, whose range is much larger.
         return math.isfinite(sum(numbers))
     except (struct.error, TypeError, ValueError, OverflowError):
         return False
@@ -220,7 +220,7 @@ def as_charges(charge_pC: ArrayLike, electrodes: tuple[str, ...], *, is_batch: b
     # Numbers are floats, signed or unsigned integers. The array has lost the mask of a masked array.
     if charges.dtype.kind not in "fiu" or np.ma.is_masked(charge_pC):
         raise ChargeError(f"expected {expected} as numbers (pC), got {charge_pC!r:.200}")
-    # The charges of one press have one axis, those of a batch have two.
+    # The charges of one press have one axis, those of a batch have two (`is_batch` counts as 0 or 1).
     if charges.ndim != 1 + is_batch or charges.shape[-1] != n_electrode:
         raise ChargeError(f"expected {expected}, got an array of shape {charges.shape}")
     return as_float32(charges.reshape(-1, n_electrode), electrodes)
@@ -356,9 +356,10 @@ class Validity:
     def area_text(self) -> str:
         """Description of the working area for messages.
 
-        If the area is a disk around the origin, the text states its radius. Otherwise, the text states its bounding
-        box.
+        If the area is nearly a disk around the origin, which the text calls the centre, the text states its radius.
+        Otherwise, the text states its bounding box.
         """
+        # The radius of the largest circle around the origin inside the area is stored as its square.
         radius_mm = math.sqrt(self.inscribed_radius_squared_mm2)
         is_round = radius_mm > MIN_ROUNDNESS * np.linalg.norm(self.corners_mm, axis=1).max()
         if is_round:
@@ -380,7 +381,8 @@ class Validity:
         with np.errstate(invalid="ignore"):  # if the last corner repeats the first corner, an edge has the length 0
             signed_distance_mm = (x_start * y_end - x_end * y_start) / np.hypot(x_end - x_start, y_end - y_start)
         # The distances are positive if the corners are in anticlockwise order, and negative if they are clockwise. If
-        # the origin is outside, both of the following radii are negative.
+        # the origin is outside, both of the following radii are negative. The distance to an edge of the length 0 is
+        # NaN, and is ignored.
         anticlockwise_radius_mm = np.nanmin(signed_distance_mm)
         clockwise_radius_mm = -np.nanmax(signed_distance_mm)
         return float(max(anticlockwise_radius_mm, clockwise_radius_mm, 0.0)) ** 2
@@ -401,6 +403,7 @@ class Validity:
         min_force_N, max_force_N = self.force_range_N
         distance_squared_mm2 = contact.x_mm * contact.x_mm + contact.y_mm * contact.y_mm
         is_in_circle = distance_squared_mm2 < self.inscribed_radius_squared_mm2
+        # Fast check with the conditions of `_conditions`, for a contact in the circle
         is_valid = (
             is_in_circle
             and min_force_N <= contact.force_N <= max_force_N
@@ -409,7 +412,7 @@ class Validity:
         )
         if is_valid:
             return ()
-        x_mm, y_mm = np.array([contact[:2]]).T
+        x_mm, y_mm = np.array([contact[:2]]).T  # arrays of shape (1,)
         is_in_area = is_in_circle or inside_polygon(x_mm, y_mm, self.corners_mm)[0]
         return tuple(word for word, is_flagged in self._conditions(contact, is_in_area).items() if is_flagged)
 
@@ -425,6 +428,7 @@ class Validity:
         with np.errstate(over="ignore"):  # a distance that overflows is infinite and exceeds the limit
             has_flag = self._conditions(contacts, inside_polygon(contacts.x_mm, contacts.y_mm, self.corners_mm))
         flags: list[tuple[str, ...]] = [()] * len(contacts.x_mm)
+        # `has_flag` contains an array of shape (n,) for each flag. The loop visits only the contacts with any flag.
         for row in np.flatnonzero(np.any(list(has_flag.values()), axis=0)):
             flags[row] = tuple(word for word, is_flagged in has_flag.items() if is_flagged[row])
         return flags
@@ -434,7 +438,7 @@ class Validity:
 
         Args:
             contact: One contact, or n contacts.
-            is_in_area: Whether the contact lies in the working area; an array of shape (n,) for n contacts.
+            is_in_area: Whether the contact lies in the working area: a bool, or an array of shape (n,) for n contacts.
 
         Returns:
             For each flag, whether its condition is true. The values have the form of `is_in_area`.
@@ -442,7 +446,7 @@ class Validity:
         min_force_N, max_force_N = self.force_range_N
         centre_x_mm, centre_y_mm = self.centre_mm
         max_distance_squared_mm2, implausible_force_N = self.implausible_limits
-        x_mm = contact.x_mm - centre_x_mm
+        x_mm = contact.x_mm - centre_x_mm  # relative to the centre of the working area
         y_mm = contact.y_mm - centre_y_mm
         return {
             OUTSIDE: np.logical_not(is_in_area) | (contact.force_N < min_force_N) | (contact.force_N > max_force_N),

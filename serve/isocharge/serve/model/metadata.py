@@ -232,6 +232,7 @@ class ModelMetadata(Settings, frozen=True, kw_only=True):
         """
         place = f"{where}: metadata"
         names = [name for name in cls.__struct_fields__ if name in props]
+        # `object` accepts every JSON value. The types are checked at the end, after the version of the format.
         with error_context(ModelError, after="; export the model again"):
             values = {name: parse_json(props[name], f"{place}: {name}", ModelError, object) for name in names}
 

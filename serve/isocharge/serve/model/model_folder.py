@@ -88,15 +88,18 @@ def find_labelled_model(label: str, models: StrPath | None = None) -> Path:
 def repositories(models: StrPath | None = None) -> list[Path]:
     """Return the repositories in which the name of a model is looked up, in the order of the search.
 
+    A repository is a folder that contains the folders of several models.
+
     Args:
-        models: Repository that is searched first. This repository must exist. The other folders need not exist.
+        models: Folder of the repository that is searched first. This folder must exist. The other folders need not
+            exist.
 
     Raises:
         ModelError: If `models` is given and is not a folder.
     """
     if models is not None and not Path(models).is_dir():
         raise ModelError(f"{models}: expected a folder of models, got no folder; correct --models or leave it out")
-    environment_folder = os.environ.get("ISOCHARGE_MODELS") or None
+    environment_folder = os.environ.get("ISOCHARGE_MODELS") or None  # an empty variable counts as missing
     folders = (models, environment_folder, "models", _released_models())
     return [Path(folder) for folder in folders if folder is not None]
 
@@ -242,7 +245,8 @@ def load_model(folder: Path) -> Model:
 def read_checked(folder: Path, name: str, golden: Golden) -> bytes:
     """Read a file of a version, and compare it with its checksum in `golden.json`.
 
-    A companion file of another model, such as `charges.npz`, would have the right format but give wrong contacts.
+    A companion file is a further file of a model, such as `charges.npz`. The companion file of another model would have
+    the right format but give wrong contacts.
 
     Args:
         folder: The version folder.
@@ -254,7 +258,8 @@ def read_checked(folder: Path, name: str, golden: Golden) -> bytes:
             in `golden.json`.
     """
     content = read_needed(folder / name, ModelError, "copy or export the model again")
-    # If `golden.json` does not list the file, the comparison with this text fails, and the message contains the text.
+    # If `golden.json` does not list the file, the text "no such file" takes the place of its checksum. The comparison
+    # then fails, and the message contains the text.
     expected_sha256 = golden.checksums.get(name, "no such file")
     actual_sha256 = sha256_of(content)
     if actual_sha256 != expected_sha256:
@@ -293,6 +298,8 @@ def check_golden(model: Model) -> None:
 def load_checked_model(folder: Path) -> Model:
     """Read a version of a model, and make all checks that do not depend on the use of the model.
 
+    One of the checks computes the golden vectors again. These are the charges and the outputs in `golden.json`.
+
     Args:
         folder: The version folder, as `find_model` returns it.
 
@@ -302,7 +309,8 @@ def load_checked_model(folder: Path) -> Model:
     """
     model = load_model(folder)
     _check_folder_names(folder, model.metadata)
-    # A companion file may be missing, or may lie in the folder without a checksum in `golden.json`.
+    # A companion file is a further file of the model, such as `charges.npz`. It may be missing, or may lie in the
+    # folder without a checksum in `golden.json` (`golden.files`).
     existing_names = {path.name for path in folder.glob("*.npz")}
     for companion_name in sorted(existing_names | model.golden.files.keys()):
         read_checked(folder, companion_name, model.golden)  # raises an error if the file is not the expected one
@@ -323,7 +331,7 @@ def _check_folder_names(folder: Path, metadata: ModelMetadata) -> None:
     Raises:
         ModelError: If the names differ from the metadata.
     """
-    name, version = folder.absolute().parts[-2:]
+    name, version = folder.absolute().parts[-2:]  # the path `../1` gives the name `..`, which is not resolved
     is_version_folder = version.isdecimal()
     is_other_version = version != str(metadata.version)
     is_other_name = name not in (metadata.name, "..")
@@ -383,7 +391,7 @@ def write_model(
         # Make all checks that are made when a model is read. The metadata in the graph must also equal the expected
         # metadata.
         model = load_model(draft)
-        differences = metadata.to_props().items() ^ model.metadata.to_props().items()
+        differences = metadata.to_props().items() ^ model.metadata.to_props().items()  # pairs in only one of the two
         if differences:
             raise ModelError(f"the graph's metadata disagree with the stated ones: {shown(sorted(differences))}")
         check_golden(model)
@@ -429,8 +437,9 @@ def check_target(folder: Path, version: int, electrodes: tuple[str, ...]) -> Pat
             "name or, if the folder was copied or renamed, its old name"
         )
 
-    last_electrodes = electrodes  # of the last version that can be read; if there is none, the new ones
-    for existing in versions.values():
+    # Electrodes of the last version that can be read; if there is none, the new electrodes
+    last_electrodes = electrodes
+    for existing in versions.values():  # from the first version to the last
         with suppress(ModelError):  # a damaged version does not prevent a new one
             last_electrodes = load_model(existing).metadata.electrodes
     if last_electrodes != electrodes:
@@ -450,7 +459,7 @@ def triton_config(name: str, n_electrode: int) -> str:
     """
     config = f'name: "{name}"\nplatform: "onnxruntime_onnx"\nmax_batch_size: {MAX_BATCH}\n'
     for list_name, widths in (("input", {INPUT: n_electrode}), ("output", OUTPUTS)):
-        # The widths do not contain the batch dimension, because Triton adds it.
+        # The widths do not contain the batch dimension, because Triton adds it. Doubled braces become single braces.
         lines = [f'  {{ name: "{tensor}" data_type: TYPE_FP32 dims: [ {width} ] }}' for tensor, width in widths.items()]
         config += f"{list_name} [\n" + ",\n".join(lines) + "\n]\n"
     return config

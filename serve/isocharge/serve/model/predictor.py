@@ -70,9 +70,11 @@ class Predictor:
         self.metadata = loaded.metadata
         self.validity = Validity.of(loaded.metadata)
         self._session = loaded.session
-        self._press = BoundPress(loaded.session, len(loaded.metadata.electrodes))
-        self._press_lock = threading.Lock()  # held while a method uses the memory of `_press`
-        self._has_warned = threading.Event()  # predictors for other noise share it
+        # Inference of one press: memory for its charges and its contact, which is bound to the session
+        self._single_inference = BoundPress(loaded.session, len(loaded.metadata.electrodes))
+        self._single_inference_lock = threading.Lock()  # held while a method uses this memory
+        # Set when the first warning is logged. The predictors that `with_noise` returns share this event.
+        self._has_warned = threading.Event()
         self.noise = loaded.metadata.noise
 
     def with_noise(self, white_pC: ArrayLike, gain: ArrayLike) -> "Predictor":
@@ -93,10 +95,11 @@ class Predictor:
             ChargeError: If a standard deviation is not a finite number of at least 0, or if a list does not have one
                 number for each electrode.
         """
+        # The noise of a charge has the variance white_pC^2 + (gain * charge)^2. "stated" is only a name.
         content = {"name": "stated", "white_pC": np.asarray(white_pC).tolist(), "gain": np.asarray(gain).tolist()}
         noise = convert(content, ModelNoise, "noise", ChargeError)  # checks the types and the signs
         try:
-            structs.replace(self.metadata, noise=noise)  # only to check the lengths of the lists
+            structs.replace(self.metadata, noise=noise)  # creates new metadata, only to check the lengths of the lists
         except WrongKey as error:
             raise ChargeError(f"{error.key}: {error}") from error
 
@@ -149,23 +152,27 @@ class Predictor:
     def predict_with_flags(self, charge_pC: ArrayLike) -> tuple[Contact, tuple[str, ...]]:
         """Compute the contact of one press as `predict` does, and the flags of the contact as `flags` does.
 
+        If the flags contain `BEYOND`, the contact cannot be a measurement. Only the first time, a warning is logged.
+
         Args:
             charge_pC: Touch charges, shape (electrodes,), pC.
 
         Raises:
             ChargeError: If the number of charges is wrong, or a charge is not finite.
         """
-        if self.noise is self.metadata.noise:
+        if self.noise is self.metadata.noise:  # `with_noise` has not changed the noise: run the model once
             values = charge_pC.tolist() if isinstance(charge_pC, np.ndarray) else charge_pC
-            press = self._press
-            with self._press_lock:
+            # Memory of one press: `write` stores the charges, `run` runs the model, and `read` returns the contact.
+            inference = self._single_inference
+            with self._single_inference_lock:
                 # `write_finite` is fast. It returns False if it cannot convert the values, or if one is not finite.
-                if not write_finite(press.write, values):
+                if not write_finite(inference.write, values):
                     # `as_charges` is slower, accepts more number types, and raises errors that name the electrode.
-                    press.write(*as_charges(charge_pC, self.metadata.electrodes, is_batch=False)[0])
-                press.run()
-                contact = Contact(*press.read())
-        else:
+                    (checked_pC,) = as_charges(charge_pC, self.metadata.electrodes, is_batch=False)
+                    inference.write(*checked_pC)
+                inference.run()
+                contact = Contact(*inference.read())
+        else:  # run the model several times, to find how the additional noise changes the contact
             contacts = self._predict_with_noise(as_charges(charge_pC, self.metadata.electrodes, is_batch=False))
             contact = Contact(*np.asarray(contacts, float)[0].tolist())
 
@@ -218,8 +225,8 @@ class Predictor:
             >>> touch.predict_into(charges, contact)  # doctest: +SKIP
         """
         try:
-            with self._press_lock:
-                self._press.run_into(charge_pC, out)
+            with self._single_inference_lock:
+                self._single_inference.run_into(charge_pC, out)
         except (AttributeError, NotImplementedError, TypeError, ValueError) as error:
             raise ChargeError(
                 f"expected charges {self.metadata.electrodes} and a writable `out` for the {len(Contact._fields)} "
@@ -243,22 +250,27 @@ class Predictor:
     def _predict_with_noise(self, charge_pC: Singles) -> Contacts:
         """Compute the contacts of n presses whose charges have more noise than the charges in the training.
 
-        The effects of the additional noise of all charges are added to the covariance of each contact. An effect is the
-        change of the contact by one standard deviation of the additional noise of one charge. The misfit is divided by
-        the ratio of the present noise to the noise of the training (root mean square over the electrodes).
+        The additional noise is the part of the present noise that exceeds the noise of the training. Its effect is the
+        change of the contact when one charge changes by one standard deviation of its additional noise. The squared
+        effects of all charges are added to the covariance of the contact. The misfit is divided by the ratio of the
+        present noise to the noise of the training (root mean square over the electrodes).
 
         Args:
             charge_pC: Touch charges, shape (n, electrodes), pC.
         """
-        model_variance = self.metadata.noise.variance(charge_pC.astype(float))
-        extra_variance = np.maximum(self.noise.variance(charge_pC.astype(float)) - model_variance, 0.0)
+        charges = charge_pC.astype(float)
+        model_variance = self.metadata.noise.variance(charges)
+        extra_variance = np.maximum(self.noise.variance(charges) - model_variance, 0.0)
         relative_extra = extra_variance / np.maximum(model_variance, np.finfo(float).tiny)  # a model may have no noise
         noise_ratio = np.sqrt(1.0 + relative_extra.mean(axis=1))
 
-        contacts, effects = self.noise_effects(charge_pC, np.sqrt(extra_variance))
+        extra_std_pC = np.sqrt(extra_variance)
+        # `contacts` contains the ten numbers of each contact, shape (n, 10). `effects` contains the changes of x, y and
+        # the force by the noise of each electrode, shape (electrodes, n, 3).
+        contacts, effects = self.noise_effects(charge_pC, extra_std_pC)
         covariance = np.einsum("kni,knj->nij", effects, effects)  # sum over the electrodes (index k)
-        misfit = (contacts[:, COLUMNS["misfit"]] / noise_ratio[:, np.newaxis]).astype(np.float32)
-        return Contacts(*add_covariance(contacts, covariance).T)._replace(misfit=misfit[:, 0])
+        result = Contacts(*add_covariance(contacts, covariance).T)
+        return result._replace(misfit=(result.misfit / noise_ratio).astype(np.float32))
 
     def noise_effects(self, charge_pC: Array, noise_std_pC: Array) -> tuple[Singles, Array]:
         """Compute contacts, and the change of each contact by the noise of each charge.
@@ -284,7 +296,8 @@ class Predictor:
         changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
         rows = self.predict_rows(changed_pC.reshape(-1, n_electrode))
         results = rows.reshape(1 + 2 * n_electrode, n_press, 10)
-        changed_contacts = results[1:, :, COLUMNS["contact"]].astype(float)  # x, y and the force after each step
+        # `COLUMNS` selects x, y and the force from the ten numbers of each contact.
+        changed_contacts = results[1:, :, COLUMNS["contact"]].astype(float)
         raised, lowered = np.split(changed_contacts, 2)
         return results[0], 0.5 * (raised - lowered)
 

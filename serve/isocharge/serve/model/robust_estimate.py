@@ -124,11 +124,12 @@ class RobustProblem:
         self._freedom = freedom
         n_press, n_electrode = charge_pC.shape
         self._measured = np.nan_to_num(measured_contacts)
-        # One over the standard deviations of the measured coordinates; 0 where a coordinate was not measured
+        # One over the standard deviations of the measured coordinates. The weight is 0 where a coordinate was not
+        # measured, because 1 / inf is 0, and NaN is replaced by 0.
         self._contact_weight = np.broadcast_to(np.nan_to_num(1.0 / contact_std), (n_press, 3))
         # Number of independent residuals of each press: its measurements minus the three unknown coordinates
         measured_count = np.count_nonzero(self._contact_weight, axis=1)
-        self._degrees = n_electrode + measured_count - 3.0
+        self._independent_count = n_electrode + measured_count - 3.0
 
     def estimate(
         self,
@@ -190,17 +191,18 @@ class RobustProblem:
             contacts: Contacts, shape (n, 3).
         """
         # Residuals divided by their standard deviations. The residuals of the charges are whitened. The residuals of
-        # coordinates that were not measured are 0.
+        # coordinates that were not measured are 0. `values` contains the predicted charges and their derivatives with
+        # respect to the contacts (`by_contact`) and to the state (`by_state`).
         values = self._model(contacts, state)
         charge_difference_pC = self._charge_pC - values.charge_pC
-        residual = (self._whitening @ charge_difference_pC[:, :, None])[:, :, 0]  # shape (n, e)
+        residual = (self._whitening @ charge_difference_pC[..., None])[..., 0]  # one matrix per press; shape (n, e)
         contact_residual = (self._measured - contacts) * self._contact_weight  # shape (n, 3)
         chi2 = (residual**2).sum(axis=1) + (contact_residual**2).sum(axis=1)  # shape (n,)
 
         # Weights and costs of a Student t distribution with nu degrees of freedom (`_freedom`), for a press with
-        # `_degrees` independent residuals
-        weights = (self._freedom + self._degrees) / (self._freedom + chi2)
-        press_cost = 0.5 * (self._freedom + self._degrees) * np.log1p(chi2 / self._freedom)
+        # `_independent_count` independent residuals
+        weights = (self._freedom + self._independent_count) / (self._freedom + chi2)
+        press_cost = 0.5 * (self._freedom + self._independent_count) * np.log1p(chi2 / self._freedom)
 
         # Cost of the deviation of the state from its Gaussian prior
         deviation = state - self._prior_mean
@@ -218,73 +220,96 @@ class RobustProblem:
         )
 
     def _normal_equations(
-        self, point: RobustPoint, contact_shift: Array, contact_by_state: Array
+        self, point: RobustPoint, contact_shift: Array, contact_by_state_step: Array
     ) -> tuple[Array, Array]:
         """Compute the normal equations N ds = g of a step ds of the state, from which the contacts are eliminated.
 
-        The method `_contact_shifts` defines the symbols, and the shifts du_i = a_i - B_i ds of the contacts. After the
-        step, the whitened residuals of press i are r_i - C_i du_i - S_i ds = (r_i - C_i a_i) - (S_i - C_i B_i) ds. The
-        step sets the derivative of the minimised function with respect to the state to zero. The prior has the mean s0
-        and the precision P. The weight w_i of press i is small if the residuals of the press are large. The condition
-        for the step then gives
+        For press i, r_i are the residuals of the e charges (measured minus predicted), shape (e,). C_i and S_i are the
+        derivatives of the predicted charges with respect to the contact, shape (e, 3), and with respect to the p
+        numbers of the state s, shape (e, p). All of them are whitened, so that the errors of the charges have the
+        standard deviation 1. A prime denotes the transpose.
+
+        After the step, the contact has moved by a_i - B_i ds. The residuals are then
+        (r_i - C_i a_i) - (S_i - C_i B_i) ds. The step sets the derivative of the minimised function with respect to the
+        state to zero. The prior has the mean s0 and the precision P. The weight w_i of press i is small if the
+        residuals of the press are large. The condition for the step then gives
 
             N = P + sum_i w_i S_i' (S_i - C_i B_i),        g = P (s0 - s) + sum_i w_i S_i' (r_i - C_i a_i).
 
         Args:
-            point: State and contacts.
-            contact_shift: Shifts a_i of the contacts, as `_contact_shifts` returns them, shape (n, 3).
-            contact_by_state: Matrices B_i, as `_contact_shifts` returns them, shape (n, 3, p).
+            point: State s and contacts, with r_i (`residual`), C_i (`by_contact`), S_i (`by_state`) and w_i
+                (`weights`).
+            contact_shift: Shifts a_i of the contacts for an unchanged state, shape (n, 3).
+            contact_by_state_step: Matrices B_i, shape (n, 3, p).
 
         Returns:
             Normal matrix N, shape (p, p), and right side g, shape (p,).
         """
-        # The rows of these arrays are all charges of all presses, so that a matrix product sums over the presses, too.
+        # The arrays are reshaped to one row for each charge of each press. A matrix product then sums over the presses.
         n_state = point.state.size
-        remaining_slopes = (point.by_state - point.by_contact @ contact_by_state).reshape(-1, n_state)  # S_i - C_i B_i
-        remaining_residual = point.residual - (point.by_contact @ contact_shift[:, :, None])[:, :, 0]  # r_i - C_i a_i
+        reduced_slopes = point.by_state - point.by_contact @ contact_by_state_step  # S_i - C_i B_i
+        reduced_residual = point.residual - (point.by_contact @ contact_shift[..., None])[..., 0]  # r_i - C_i a_i
         weighted_slopes = (point.weights[:, None, None] * point.by_state).reshape(-1, n_state)  # w_i S_i
-        normal_matrix = self._precision + weighted_slopes.T @ remaining_slopes
-        prior_side = self._precision @ (self._prior_mean - point.state)
-        right_side = prior_side + weighted_slopes.T @ remaining_residual.ravel()
+        normal_matrix = self._precision + weighted_slopes.T @ reduced_slopes.reshape(-1, n_state)
+        prior_side = self._precision @ (self._prior_mean - point.state)  # P (s0 - s)
+        right_side = prior_side + weighted_slopes.T @ reduced_residual.ravel()
         symmetric_matrix = 0.5 * (normal_matrix + normal_matrix.T)  # N is symmetric except for rounding errors
         return symmetric_matrix, right_side
 
     def _contact_shifts(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
         """Compute how the contacts move, as a linear function of the step of the state.
 
-        The whitened derivatives of press i are C_i with respect to its contact and S_i with respect to the state. For a
-        step ds of the state, the contact moves by du_i = a_i - B_i ds, with a_i = M_i^-1 (C_i' r_i + W m_i) and
-        B_i = M_i^-1 C_i' S_i. r_i are the residuals of the charges, and m_i are the residuals of the measured
-        coordinates, in standard deviations. W is the diagonal matrix of the inverse standard deviations of the
-        coordinates, and M_i is C_i' C_i + W^2 with a damped diagonal.
+        For a step ds of the state, the contact of press i moves by a_i - B_i ds. With a prime for the transpose,
+
+            M_i a_i = C_i' r_i + W_i m_i,        M_i B_i = C_i' S_i,        M_i = C_i' C_i + W_i^2 (damped).
+
+        - C_i and S_i are the whitened derivatives of the predicted charges with respect to the contact and the state.
+        - r_i are the whitened residuals of the charges, measured minus predicted.
+        - m_i are the measured minus the present coordinates, divided by their standard deviations.
+        - W_i is the diagonal matrix of the inverse standard deviations of the measured coordinates. Its elements are 0
+          for coordinates that were not measured.
 
         Args:
-            point: State and contacts.
-            damping: Damping of the contacts, relative to the diagonals of the matrices C_i' C_i + W^2.
+            point: State and contacts, with C_i (`by_contact`), S_i (`by_state`), r_i (`residual`) and m_i
+                (`contact_residual`).
+            damping: Relative increase of the diagonals of the matrices M_i.
 
         Returns:
             The shifts a_i, shape (n, 3), and the matrices B_i, shape (n, 3, p).
         """
-        transposed = point.by_contact.swapaxes(1, 2)
-        contact_matrix = transposed @ point.by_contact  # becomes M_i
-        diagonal = np.einsum("nkk->nk", contact_matrix)  # a view, through which the matrices are changed
-        diagonal += self._contact_weight**2
+        transposed = point.by_contact.swapaxes(1, 2)  # C_i'
+        contact_matrix = transposed @ point.by_contact  # C_i' C_i; the following lines change it to M_i
+        diagonal = np.einsum("nkk->nk", contact_matrix)  # a view; the changes of the view change the matrices
+        diagonal += self._contact_weight**2  # the diagonal of W_i^2
         diagonal *= 1.0 + damping
-        # The smallest number is for contacts that change no charge.
+        # The diagonal becomes a little larger, so that every matrix can be inverted. The smallest positive number is
+        # for contacts that change no charge, and whose matrix is zero.
         diagonal += RELATIVE_RIDGE * diagonal.sum(axis=1, keepdims=True) + np.finfo(float).tiny
 
-        # Solve for a_i and for the columns of B_i at once. The right sides are C_i' r_i + W m_i and C_i' S_i.
-        charge_part = (transposed @ point.residual[:, :, None])[:, :, 0]
+        # Solve for a_i and for the columns of B_i at once. The right sides are C_i' r_i + W_i m_i and C_i' S_i.
+        charge_part = (transposed @ point.residual[..., None])[..., 0]
         contact_side = charge_part + self._contact_weight * point.contact_residual
         state_sides = transposed @ point.by_state  # shape (n, 3, p)
-        right_sides = np.concatenate([contact_side[:, :, None], state_sides], axis=2)
+        right_sides = np.concatenate([contact_side[..., None], state_sides], axis=2)
         solution = np.linalg.solve(contact_matrix, right_sides)
         return solution[:, :, 0], solution[:, :, 1:]
 
     def step(self, point: RobustPoint, damping: float) -> tuple[Array, Array]:
-        """Compute a damped Gauss-Newton step of the state, shape (p,), and of the contacts, shape (n, 3)."""
-        contact_shift, contact_by_state = self._contact_shifts(point, damping)
-        normal_matrix, right_side = self._normal_equations(point, contact_shift, contact_by_state)
+        """Compute a damped Gauss-Newton step of the state and of the contacts.
+
+        The contacts are first expressed by the step of the state: a contact moves by its shift for an unchanged state,
+        minus a matrix times the step. The normal equations then contain only the p unknowns of the state.
+
+        Args:
+            point: State and n contacts at which the model is linearised.
+            damping: Relative increase of the diagonals of the normal matrices (Levenberg-Marquardt).
+
+        Returns:
+            Step of the state, shape (p,), and steps of the contacts, shape (n, 3).
+        """
+        contact_shift, contact_by_state_step = self._contact_shifts(point, damping)  # shapes (n, 3) and (n, 3, p)
+        normal_matrix, right_side = self._normal_equations(point, contact_shift, contact_by_state_step)
         damped_matrix = normal_matrix + damping * np.diag(np.diag(normal_matrix))
         state_step = np.linalg.solve(damped_matrix, right_side)
-        return np.asarray(state_step), contact_shift - contact_by_state @ state_step
+        contact_step = contact_shift - contact_by_state_step @ state_step
+        return np.asarray(state_step), contact_step

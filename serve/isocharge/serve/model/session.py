@@ -69,7 +69,7 @@ def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
     Raises:
         ModelError: If the bytes are not an ONNX graph that onnxruntime can run, or if the graph loads external data.
     """
-    if EXTERNAL_DATA in onnx_model:
+    if EXTERNAL_DATA in onnx_model:  # the bytes of the key that names an external file
         raise ModelError(
             f"{where}: expected a model with all of its numbers inside, got one that loads external data from another "
             "file, which no checksum covers; save the model again with onnx.save(model, path, "
@@ -79,7 +79,7 @@ def open_session(onnx_model: bytes, where: str) -> ort.InferenceSession:
     options.intra_op_num_threads = 1  # starts no other threads
     try:
         session = ort.InferenceSession(onnx_model, options, providers=["CPUExecutionProvider"])
-        # onnxruntime raises an exception when a text that is not valid UTF-8 is read.
+        # Read all texts, because onnxruntime raises an exception when a text that is not valid UTF-8 is read.
         _ = session.get_modelmeta().custom_metadata_map
         _ = [tensor.name for tensor in (*session.get_inputs(), *session.get_outputs())]
         return session
@@ -98,7 +98,7 @@ def run(session: ort.InferenceSession, charge_pC: Singles) -> dict[str, Singles]
         charge_pC: Charges, shape (n, electrodes), pC.
 
     Returns:
-        Outputs by name in the order of `OUTPUTS`, each of shape (n, width).
+        Outputs by name in the order of `OUTPUTS`, each of shape (n, width). `OUTPUTS` contains the width of each.
 
     Raises:
         ModelError: If onnxruntime cannot run the graph on these charges, or an output has another shape than the graph
@@ -108,7 +108,7 @@ def run(session: ort.InferenceSession, charge_pC: Singles) -> dict[str, Singles]
         outputs = dict(zip(OUTPUTS, session.run(tuple(OUTPUTS), {INPUT: charge_pC}), strict=True))
         for name, width in OUTPUTS.items():
             if outputs[name].shape != (len(charge_pC), width):
-                raise ValueError(f"{name} has the shape {outputs[name].shape}")
+                raise ValueError(f"{name} has the shape {outputs[name].shape}")  # becomes a ModelError below
     except Exception as error:  # onnxruntime's exceptions have no common base class of their own
         raise ModelError(
             f"the model's graph fails when it is run ({cut(str(error))}); copy or export it again"
@@ -227,10 +227,11 @@ def contact_floors(metadata: ModelMetadata) -> tuple[float, float, float]:
     Args:
         metadata: Metadata of the model.
     """
-    position_floor_mm, _, force_floor_N = FLOORS["contact"]
+    position_floor_mm, _, force_floor_N = FLOORS["contact"]  # smallest floors of x, y (the same as of x) and the force
     radius_mm = max(math.hypot(x_mm, y_mm) for x_mm, y_mm in metadata.working_area_mm)
     position_rms_mm = metadata.errors.get("position_rms_mm", 0.0)
     _min_force_N, max_force_N = metadata.force_range_N
+    # `RANGE_SHARE` is the floor relative to the range of positions or forces.
     position_floor_mm = max(position_floor_mm, RANGE_SHARE * radius_mm, position_rms_mm)
     return position_floor_mm, position_floor_mm, max(force_floor_N, RANGE_SHARE * max_force_N)
 
@@ -313,6 +314,7 @@ def make_golden(
                 f"the new model: {name}: expected finite outputs, got {rows[~is_finite][0]} for the charges "
                 f"{charge_pC[~is_finite][0]} pC"
             )
+    # `FLOORS` contains the floors of each output by its name. The floors of two outputs depend on the model.
     return Golden(
         sha256=sha256_of(onnx_model),
         tolerance=Tolerance(RELATIVE_TOLERANCE, FLOORS | {"contact": contact_floor, "contact_std": contact_floor}),
@@ -332,24 +334,27 @@ def read_golden(path: Path) -> Golden:
         golden = read_json(path, "golden vectors", ModelError, Golden)
         try:
             _check_sizes(golden)
-        except (ValueError, KeyError) as error:
+        except (ValueError, KeyError) as error:  # a KeyError if an output or its floors are missing
             raise ModelError(f"{path}: {error}") from error
     return golden
 
 
 def _check_sizes(golden: Golden) -> None:
-    """Check that each output has a row for each press, and a number and a floor for each of its columns.
+    """Check that each stored output has one row for each press, and one number and one floor for each of its columns.
+
+    The floor of a column is the magnitude below which the tolerance of its numbers is constant instead of proportional
+    to the number.
 
     Raises:
         ValueError: If an output has another size, or rows of different lengths.
         KeyError: If an output or its floors are missing.
     """
     n_press = len(golden.charge_pC)
-    for name, width in OUTPUTS.items():
-        shape = np.shape(golden.outputs[name])
-        n_floor = len(golden.tolerance.floor[name])
-        if shape != (n_press, width) or n_floor != width:
+    for name, column_count in OUTPUTS.items():
+        actual_shape = np.shape(golden.outputs[name])
+        floor_count = len(golden.tolerance.floor[name])
+        if actual_shape != (n_press, column_count) or floor_count != column_count:
             raise ValueError(
-                f"{name}: expected {n_press} rows of {width} numbers, and {width} floors, got an array of shape "
-                f"{shape} and {n_floor} floors"
+                f"{name}: expected {n_press} rows of {column_count} numbers, and {column_count} floors, got an array "
+                f"of shape {actual_shape} and {floor_count} floors"
             )
