@@ -39,7 +39,7 @@ class Address:
         """
         try:
             if self.uds is not None:
-                self.release()
+                self.release()  # removes the file that a server has left behind if it did not end normally
                 return _listen_unix(self.uds)
             # create_server sets SO_REUSEADDR. The port of an earlier server can therefore be used again at once.
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET

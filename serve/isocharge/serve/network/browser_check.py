@@ -61,14 +61,16 @@ class AccessCheck:
     ) -> None:
         """Check and store the names of the server and the token; the docstring of the class describes the arguments."""
         names = [allowed_hosts] if isinstance(allowed_hosts, str) else allowed_hosts
-        self._allowed_names = frozenset(map(host_name, names))
-        self._host_names = self._allowed_names | {"localhost", host.lower()}
+        self._allowed_names = frozenset(map(host_name, names))  # checked, in lower case
+        self._host_names = self._allowed_names | {"localhost", host.lower()}  # also the own names of the server
+        # Printable ASCII characters (from the blank to ~) without %, and no blank at the beginning and at the end
         if token is not None and not re.fullmatch(r"(?! )[ -$&-~]+(?<! )", token):
             raise InputError(
                 "token: expected printable ASCII characters without blanks at the ends, and no %, which has another "
                 "meaning in the address of a page; choose another one"
             )
         self._token = token
+        # A server with a token accepts every host name, because a page of another site does not have the token.
         self._any_host = any_host or token is not None
 
     def check(self, method: str, headers: Headers, *, needs_token: bool = True) -> None:
@@ -103,8 +105,9 @@ class AccessCheck:
             )
 
         # Without `Origin`, `Sec-Fetch-Site` decides. Browsers send `same-origin` if a page of this server sends the
-        # request, and `none` if the user has typed the address. Other programs do not send the header. A link on
-        # another site may open a page of this server, because the other site cannot read the response.
+        # request, and `none` if the user has typed the address. Other programs do not send the header, which is then
+        # treated as `none`. A link on another site may open a page of this server, because the other site cannot read
+        # the response.
         fetch_site = headers.get(b"sec-fetch-site", b"none").decode("latin-1")
         is_link = headers.get(b"sec-fetch-dest") == b"document" and method in ("GET", "HEAD")
         if not (origin or is_link or fetch_site in ("same-origin", "none")):
@@ -148,22 +151,22 @@ class AccessCheck:
         A page belongs to this server in two cases:
 
         - Its origin contains the same host and the same port as the header `Host`.
-        - Its host name is one of `allowed_hosts`, and a reverse proxy has changed the header `Host`: the header
-          contains another name, or the same name without the port.
+        - Its host name is one of `allowed_hosts`, and a reverse proxy has changed the header `Host`. Such a header
+          contains another name than the origin, or the same name without the port.
 
         Args:
             origin: Value of the header `Origin`, which is the origin of the page, such as "http://localhost:8000".
             host: Value of the header `Host`, for example "localhost:8000".
         """
-        scheme, _, page_host = origin.partition("://")
+        scheme, _, page_address = origin.partition("://")  # the address is the host name and, if given, the port
         default_port = ":443" if scheme == "https" else ":80"  # which proxies may add
-        if host in (page_host, page_host + default_port):
+        if host in (page_address, page_address + default_port):
             return True
-        # The following names contain no ports. If the names are equal and both have a port, the page belongs to another
-        # server on the same machine.
-        page_name = _name_in(page_host)
-        is_port_removed = page_host.startswith(f"{host}:")
-        return page_name in self._allowed_names and (page_name != _name_in(host) or is_port_removed)
+        # If the names are equal and both have a port, the page belongs to another server on the same machine.
+        page_name = _name_in(page_address)  # the host name without the port
+        is_port_removed = page_address.startswith(f"{host}:")
+        is_host_changed = is_port_removed or page_name != _name_in(host)  # by a reverse proxy
+        return page_name in self._allowed_names and is_host_changed
 
 
 def header_values(headers: Iterable[tuple[bytes, bytes]]) -> Headers:

@@ -66,7 +66,10 @@ class Statistics(NamedTuple):
             yield from metric.collect()
 
     def to_json(self) -> dict[str, Any]:
-        """Return the counters of a version as a JSON object with the names that Triton uses in its statistics."""
+        """Return the counters of a version of a model as a JSON object with the names that Triton uses.
+
+        An execution is an answered request, which may contain many presses.
+        """
         values = {sample.name: sample.value for metric in self.collect() for sample in metric.samples}
         refused = int(values["isocharge_inferences_refused_total"])
         answered = int(values["isocharge_inference_seconds_count"]) - refused

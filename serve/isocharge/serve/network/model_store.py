@@ -82,7 +82,7 @@ class ModelStore:
         Raises:
             ModelError: If `models` is not a folder or contains no model, or if no version passes its checks.
         """
-        roots = repositories(models)
+        roots = repositories(models)  # `models` first, and then the repositories that are always searched
         self._roots = roots if models is None else roots[:1]
         self._change_lock = threading.Lock()
         self._statistics = Statistics.of_all_versions()
@@ -106,7 +106,7 @@ class ModelStore:
             ModelNotFound: If the version is not loaded. The message lists the loaded versions, and states why the
                 version was refused or unloaded.
         """
-        versions = self.versions_of(name, version)
+        versions = self.versions_of(name, version)  # loaded versions, sorted by number
         if versions:
             return versions[-1]
         label = f"{name}/{version}" if version else name
@@ -121,17 +121,17 @@ class ModelStore:
             name: Name of the only model whose versions are returned. None selects all models.
             version: Number of the only version that is returned, as a text. An empty text selects all versions.
         """
-        return [row.loaded for row in self._find(name, version) if row.loaded]
+        return [match.loaded for match in self._matching_versions(name, version) if match.loaded]
 
     def refusals(self, name: str | None = None, version: str = "") -> list[str]:
         """Return the reasons why versions were refused or unloaded. `versions_of` describes the arguments."""
-        return [row.reason for row in self._find(name, version) if row.reason]
+        return [match.reason for match in self._matching_versions(name, version) if match.reason]
 
-    def _find(self, name: str | None = None, version: str = "") -> list[Version]:
+    def _matching_versions(self, name: str | None = None, version: str = "") -> list[Version]:
         """Return the versions that match the arguments of `versions_of`, whether or not they are loaded."""
         names = sorted(self._versions) if name is None else [name]
-        rows = [row for name in names for row in self._versions.get(name, ())]
-        return [row for row in rows if version in ("", str(row.number))]
+        candidates = [candidate for name in names for candidate in self._versions.get(name, ())]
+        return [candidate for candidate in candidates if version in ("", str(candidate.number))]
 
     def index(self) -> list[dict[str, str]]:
         """Return one row for each version that is loaded, refused or unloaded, and for each model without versions.
@@ -139,15 +139,15 @@ class ModelStore:
         A row contains the name of the model, and the number and the state of the version. If the version was refused or
         unloaded, the row also contains the reason. The number is empty if no version of a model was found.
         """
-        new_models = [Version(name, 0) for name in self._folders() if not self._find(name)]
+        new_models = [Version(name, 0) for name in self._folders() if not self._matching_versions(name)]
         return [
             {
-                "name": row.name,
-                "version": str(row.number or ""),
-                "state": "READY" if row.loaded else "UNAVAILABLE",
-                "reason": row.reason,
+                "name": version.name,
+                "version": str(version.number or ""),
+                "state": "READY" if version.loaded else "UNAVAILABLE",
+                "reason": version.reason,
             }
-            for row in sorted([*self._find(), *new_models])
+            for version in sorted([*self._matching_versions(), *new_models])
         ]
 
     def load_all(self) -> None:
@@ -178,7 +178,7 @@ class ModelStore:
         with self._change_lock:
             folders = self._folders()
             self._load_versions(name, folders.get(name))
-        if name not in folders:
+        if name not in folders:  # its loaded versions have just been kept, because no version was found
             raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
         # All valid versions are loaded now. The error only reports which versions are refused.
         reasons = self.refusals(name)
@@ -194,7 +194,7 @@ class ModelStore:
         with self._change_lock:
             self.get(name)  # raises ModelNotFound
             self._versions = self._versions | {
-                name: [row._replace(loaded=None, reason="unloaded") for row in self._find(name)]
+                name: [version._replace(loaded=None, reason="unloaded") for version in self._matching_versions(name)]
             }
 
     def _folders(self) -> Mapping[str, Path]:
@@ -204,6 +204,8 @@ class ModelStore:
     def _load_versions(self, name: str, folder: Path | None) -> None:
         """Load every version in the folder of a model, and replace the versions that were loaded before.
 
+        A version is refused if it cannot be loaded. Its field `reason` then states why, and is otherwise an empty text.
+
         Earlier versions that are no longer in the folder are removed. If a version is refused, or if the folder
         contains no version, the earlier versions are kept.
 
@@ -211,30 +213,33 @@ class ModelStore:
             name: Name of the model.
             folder: Folder of the model, or None if there is no such folder.
         """
-        earlier = {row.number: row._replace(reason="") for row in self._find(name) if row.loaded}
-        present: dict[int, Version] = {}  # by number
+        # Loaded versions by number, without the reasons of earlier refusals
+        earlier = {
+            version.number: version._replace(reason="") for version in self._matching_versions(name) if version.loaded
+        }
+        found: dict[int, Version] = {}  # versions in the folder by number, loaded or refused
         try:
             folders = version_folders(folder) if folder else {}
         except ModelError as error:  # the folder cannot be listed
             folders = {}
-            present[0] = Version(name, 0, reason=str(error))
+            found[0] = Version(name, 0, reason=str(error))  # the number 0 stands for the whole model
         for number, version_folder in folders.items():
             try:
                 loaded = LoadedVersion(version_folder, self._statistics.of(name, number))
-                present[number] = Version(name, number, loaded)
+                found[number] = Version(name, number, loaded)
             except Exception as error:  # any error in one folder must not affect the other models
                 version = earlier.get(number, Version(name, number))  # keep what was loaded from the old files
                 reason = str(error) if isinstance(error, ModelError) else f"{version_folder}: {error!r}"
-                present[number] = version._replace(reason=reason)
+                found[number] = version._replace(reason=reason)
 
-        is_incomplete = not present or any(version.reason for version in present.values())
-        versions = earlier | present if is_incomplete else present
+        keeps_earlier = not found or any(version.reason for version in found.values())
+        versions = earlier | found if keeps_earlier else found
         self._versions = self._versions | {name: sorted(versions.values())}
 
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics of all models for Prometheus. A registry calls this method."""
         ready = GaugeMetricFamily("isocharge_model_ready", "Whether a version is loaded.", labels=("model", "version"))
-        for row in self._find():
-            ready.add_metric((row.name, str(row.number)), row.loaded is not None)
+        for version in self._matching_versions():  # all versions of all models
+            ready.add_metric((version.name, str(version.number)), version.loaded is not None)
         yield ready
         yield from self._statistics.collect()

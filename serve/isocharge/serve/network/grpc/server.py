@@ -22,10 +22,11 @@ MIN_PING_MS = 5000
 
 @asynccontextmanager
 async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
-    """Return a context manager that runs a gRPC server in the present event loop until the `async with` block ends.
+    """Run a gRPC server in the present event loop until the `async with` block ends.
 
-    At the end of the block, all calls that have begun are finished. grpcio cancels the calls that it has received but
-    not begun. If the exit of the block is cancelled, all calls are ended at once.
+    The decorator turns the function into a context manager. At the end of the block, all calls that have begun are
+    finished. grpcio cancels the calls that it has received but not begun. If the exit of the block is cancelled, all
+    calls are ended at once.
 
     Args:
         handler: Handler of the HTTP server. The gRPC server uses its models, limits and token. Clients send the token
@@ -53,7 +54,8 @@ async def grpc_server(handler: Handler, host: str, port: int, tls: Tls | None = 
         ("grpc.so_reuseport", 0),
     ]
     # The service limits the number of open calls to `connections`. If a new call exceeds this limit, the service ends a
-    # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher.
+    # waiting call instead of refusing the new call. grpcio would refuse the new call, so its own limit must be higher,
+    # here twice as high.
     server = grpc.aio.server(options=options, maximum_concurrent_rpcs=2 * limits.connections)
     service = Service(handler)
     methods = {name: grpc.stream_stream_rpc_method_handler(partial(service.handle, name)) for name in METHODS}

@@ -66,8 +66,9 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
                 "name": tensor.name,
                 "datatype": tensor.datatype,
                 "shape": [*tensor.shape],
-                # Numbers of the type FP32 are in the list `fp32_contents`, for example. The list is empty if the client
-                # has sent raw contents instead, and `InferBody` states this by None.
+                # Numbers of the type FP32 are in the list `fp32_contents`, for example. There is no such list if the
+                # type is unknown. The list is empty if the client has sent raw contents instead, and `InferBody` states
+                # this by None.
                 "data": [*getattr(tensor.contents, f"{tensor.datatype.lower()}_contents", ())] or None,
             }
             for tensor in message.inputs
@@ -79,16 +80,19 @@ def read_request(message: Any) -> tuple[InferBody, bytes]:
 
 
 def write_response(content: Json, raw_contents: list[bytes]) -> Any:
-    """Convert the content of an HTTP response to a ModelInferResponse.
+    """Convert the content of an HTTP response to a ModelInferResponse, and return this message.
+
+    The message is not sent here.
 
     Args:
-        content: Content of the HTTP response.
+        content: Content of the HTTP response. The function changes its outputs.
         raw_contents: Binary tensors of all outputs. The list is empty if the content itself contains the values of the
             outputs.
     """
     for tensor in content["outputs"]:
         if raw_contents:
-            del tensor["parameters"]  # the raw contents themselves have a length
+            # The only parameter is the size of the binary tensor. In the message, each raw content has a length itself.
+            del tensor["parameters"]
         elif tensor["datatype"] == "BYTES":
             tensor["contents"] = {"bytes_contents": [text.encode() for text in tensor.pop("data")]}
         else:
@@ -125,7 +129,7 @@ class Service:
     """gRPC service that answers calls with the models, the token and the limits of a `Handler`."""
 
     def __init__(self, handler: Handler) -> None:
-        """Share the models, limits, counters and access check of the HTTP server, and prepare the gRPC methods.
+        """Share the models, limits, counters and access check of the HTTP server, and count the open calls.
 
         Args:
             handler: Handler of the requests of the HTTP server.
@@ -134,8 +138,8 @@ class Service:
         self._open_count = 0
         self._is_stopping = False
         # One timeout for each call that waits for a message of its client, in the order in which the waits began. The
-        # dictionary has no values and serves as an ordered set.
-        self._waiting: dict[asyncio.Timeout, None] = {}
+        # dictionary serves as an ordered set: all its values are None.
+        self._waiting_timeouts: dict[asyncio.Timeout, None] = {}
         handler.traffic.open.labels("grpc").set_function(lambda: self._open_count)
 
     async def handle(self, name: str, _messages: object, context: ServicerContext) -> None:
@@ -160,7 +164,7 @@ class Service:
             self._limit_open_calls()
             await self._answer(name, context)
             status = "OK"
-        except InternalError as error:  # the client ended the call while a message was read or sent
+        except InternalError as error:  # the client has ended the call during a read or a write
             raise asyncio.CancelledError from error
         except Exception as error:  # every error is sent to the client
             reported_error = RequestError(TIMEOUT_MESSAGE, 408) if isinstance(error, TimeoutError) else error
@@ -169,7 +173,7 @@ class Service:
         finally:
             self._open_count -= 1
             self._handler.traffic.count("grpc", name, status, client, start_ns)
-        if error_message:
+        if error_message:  # the call was refused; send the status and the message to the client
             await context.abort(grpc.StatusCode[status], error_message)
 
     async def _answer(self, name: str, context: ServicerContext) -> None:
@@ -192,12 +196,12 @@ class Service:
             metadata = dict(context.invocation_metadata())
             authorization = metadata.get("authorization", "")
             self._handler.access.check_token(authorization.encode())
-        timeout_s = self._handler.limits.header_seconds
+        timeout_s = self._handler.limits.header_seconds  # for the first message; later messages have another timeout
         while (data := await self._next_message(context, timeout_s)) is not EOF:
-            if name.startswith("RepositoryModel"):  # loading a model takes a long time
-                response = await asyncio.to_thread(self._respond, name, data)
+            if name.startswith("RepositoryModel"):  # these methods load or unload a model, which may take a long time
+                response = await asyncio.to_thread(self._response_to, name, data)
             else:
-                response = self._respond(name, data)
+                response = self._response_to(name, data)
             async with asyncio.timeout(self._handler.limits.body_seconds):
                 await context.write(response.SerializeToString())
             if name != STREAM_METHOD or self._is_stopping:
@@ -206,8 +210,11 @@ class Service:
         if name != STREAM_METHOD:
             raise RequestError("expected one message, got none")
 
-    def _respond(self, name: str, data: bytes) -> Any:
+    def _response_to(self, name: str, data: bytes) -> Any:
         """Answer one message, and return the response.
+
+        An inference is answered by a model, and any other request as by the HTTP server. In the method `STREAM_METHOD`,
+        a response contains either the result of an inference or an error message.
 
         Args:
             name: Name of the method.
@@ -235,11 +242,14 @@ class Service:
         return ParseDict(self._answer_like_http(name, request), response_type())
 
     def _answer_like_http(self, name: str, request: Any) -> Json:
-        """Answer a message with the route of the HTTP server, and return the fields of the response.
+        """Answer a message with the route of the HTTP server that gives the same answer.
 
         Args:
             name: Name of the method, which is not a method for inferences.
             request: The message.
+
+        Returns:
+            Values of the fields of the response by name.
 
         Raises:
             IsochargeError: If the request is refused.
@@ -248,16 +258,20 @@ class Service:
         # messages. Messages about the server contain none of these fields.
         model_name = getattr(request, "model_name", "") or getattr(request, "name", "")
         model_version = getattr(request, "version", "")
-        # The body of the equivalent HTTP request has the fields `ready` and `parameters` of the message.
+        # The body contains all fields of the message. The routes read only `ready` (whether an index lists only loaded
+        # versions) and `parameters` (of loading a model).
         body = MessageToJson(request).encode()
-        equivalent = Request(self._handler.store, self._handler.traffic, {}, body, model_name, model_version)
+        equivalent = Request(
+            self._handler.store, self._handler.traffic, headers={}, body=body, name=model_name, version=model_version
+        )
         try:
-            answer = ROUTE_OF_METHOD[name].respond(equivalent)
-        except ModelError:
+            content = ROUTE_OF_METHOD[name].respond(equivalent)
+        except ModelError:  # the server or the model is not ready
             if name not in ("ServerReady", "ModelReady"):
                 raise
             return {"ready": False}  # gRPC has no status for this answer
-        return {ANSWER_FIELDS[name]: answer} if name in ANSWER_FIELDS else answer
+        # Some responses have a single field, whose value is the content of the HTTP response.
+        return {ANSWER_FIELDS[name]: content} if name in ANSWER_FIELDS else content
 
     def _infer(self, request: Any) -> Any:
         """Run a model on the charges of a ModelInferRequest, and return the ModelInferResponse."""
@@ -274,12 +288,12 @@ class Service:
         """
         if self._open_count <= self._handler.limits.connections:
             return
-        oldest_timeout = next(iter(self._waiting), None)  # the first element has waited longest
+        oldest_timeout = next(iter(self._waiting_timeouts), None)  # the first element has waited longest
         if oldest_timeout is None:
             raise RequestError(f"all {self._handler.limits.connections} calls are taken; try again later", 429)
-        # A timeout with a deadline in the past expires at once, and ends its call. The call counts as open until its
-        # coroutine ends. The count may briefly exceed the limit.
-        del self._waiting[oldest_timeout]
+        # A timeout with a deadline in the past, such as 0, expires at once, and ends its call. The call counts as open
+        # until its coroutine ends. The count may briefly exceed the limit.
+        del self._waiting_timeouts[oldest_timeout]
         oldest_timeout.reschedule(0.0)
 
     def end_streams(self) -> None:
@@ -289,7 +303,7 @@ class Service:
         """
         self._is_stopping = True
         deadline = asyncio.get_running_loop().time() + 0.1
-        for timeout in self._waiting:
+        for timeout in self._waiting_timeouts:
             timeout.reschedule(deadline)
 
     async def _next_message(self, context: ServicerContext, timeout_s: float) -> Any:
@@ -309,8 +323,10 @@ class Service:
                 call or because the server stops.
         """
         async with asyncio.timeout(timeout_s) as timeout:
-            self._waiting[timeout] = None  # `_limit_open_calls` may let this timeout expire early
+            # The dictionary serves as an ordered set. `_limit_open_calls` and `end_streams` may reschedule this timeout
+            # so that it expires early.
+            self._waiting_timeouts[timeout] = None
             try:
                 return await context.read()
             finally:
-                self._waiting.pop(timeout, None)
+                self._waiting_timeouts.pop(timeout, None)

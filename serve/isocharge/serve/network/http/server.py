@@ -43,16 +43,22 @@ class Connection(HttpToolsProtocol):
             uvicorn_arguments: Arguments that uvicorn passes to its protocols.
         """
         super().__init__(**uvicorn_arguments)
-        self.deadline = math.inf
-        self._write_deadline = self.loop.time() + limits.body_seconds  # for reading the responses, s
+        # Both deadlines are in s on the clock of the event loop. `deadline` is for further data from the client. The
+        # client must read the sent responses by `_response_deadline`.
+        self.deadline = math.inf  # no deadline
+        self._response_deadline = self.loop.time() + limits.body_seconds  # this limit is also for reading responses
         self._limits = limits
         self._traffic = traffic
-        self._previous_cycle: Any = None  # the request before the latest one whose headers are complete
-        self._is_reading = False  # whether a request has begun and is not complete
+        # uvicorn calls a request and its response a cycle. `self.cycle` belongs to the latest request whose headers are
+        # complete, and this attribute to the request before that one.
+        self._previous_cycle: Any = None
+        self._is_receiving = False  # whether a request has begun and is not complete
         self._is_stopping = False  # whether the next response closes the connection, because the server stops
-        self._pending_bytes = 0  # bytes since the latest complete head, part of a body, or complete request
+        # Number of received bytes of an incomplete head (request line and headers), trailer or chunk extension. A
+        # complete head, a part of a body and the end of a request set this number to 0.
+        self._head_bytes = 0
 
-    def _allow(self, seconds: float) -> None:
+    def _set_deadline(self, seconds: float) -> None:
         """Set the deadline for further data from the client to the present time plus `seconds`."""
         self.deadline = self.loop.time() + seconds
 
@@ -64,7 +70,7 @@ class Connection(HttpToolsProtocol):
         other connection waits for a request, the new connection is refused.
         """
         super().connection_made(transport)
-        self._allow(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
+        self._set_deadline(self._limits.header_seconds)  # the TLS handshake, which is over, has a limit of its own
         if len(self.connections) <= self._limits.connections:
             return
         others: Any = self.connections - {self}  # all connections are of this class
@@ -77,22 +83,25 @@ class Connection(HttpToolsProtocol):
     @property
     def is_idle(self) -> bool:
         """Whether the server owes no response to this connection."""
-        is_answered = self.cycle is None or (self.cycle.response_complete and not self._is_reading)
+        is_answered = self.cycle is None or (self.cycle.response_complete and not self._is_receiving)
         return is_answered and not self.transport.is_closing()
 
     def data_received(self, data: bytes) -> None:
         """Parse data of the client in pieces. Refuse a request whose head, trailers or chunk extensions are too long.
 
-        The bytes are counted from the end of the previous request. If a piece of the data contains this end and the
-        beginning of the next head, this beginning is not counted. Such a head may therefore be twice as long.
+        `_head_bytes` counts the received bytes. The parser calls other methods of this class, which set the number to 0
+        after a complete head, a part of a body and the end of a request. Bodies are therefore not limited here. If a
+        piece contains the end of a request and the beginning of the next head, this beginning is not counted. Such a
+        head may therefore be twice as long.
         """
         limit = self._limits.header_bytes
         while data and not self.transport.is_closing():
-            piece = data[: limit + 1 - self._pending_bytes]  # one byte more than permitted shows that it is too much
+            # Take at most one byte more than the limit permits, which is enough to detect an excess.
+            piece = data[: limit + 1 - self._head_bytes]
             data = data[len(piece) :]
-            self._pending_bytes += len(piece)  # the parser may reset this number in the next line
+            self._head_bytes += len(piece)  # the parser may set this number to 0 in the next line
             super().data_received(piece)
-            if self._pending_bytes > limit:
+            if self._head_bytes > limit:
                 self.refuse(431, f"the request line and headers are longer than {limit} bytes")
                 return
 
@@ -102,26 +111,27 @@ class Connection(HttpToolsProtocol):
         An HTTP connection is kept open until all complete requests are answered. With TLS, both directions can only be
         closed together.
         """
-        has_open_requests = self._close_after_responses()
+        has_open_requests = self._close_after_owed_response()  # whether a complete request is not answered yet
         return has_open_requests and self.scheme == "http"
 
     def on_message_begin(self) -> None:
         """Begin a request, and refuse it if too many requests wait for the response to an earlier request."""
         if len(self.pipeline) >= self._limits.connection_requests:
             raise httptools.HttpParserError  # uvicorn calls `send_400_response`; the parser ignores all later data
-        self._is_reading = True
-        self._allow(self._limits.header_seconds)
+        self._is_receiving = True
+        self._set_deadline(self._limits.header_seconds)
         super().on_message_begin()
 
     def on_headers_complete(self) -> None:
         """Set the deadline of the body, and discard the trailers that may follow the body (RFC 9110, 6.5.1).
 
-        The response closes the connection if the server stops, or if the client requests an upgrade.
+        The response closes the connection if the server stops, or if the client requests an upgrade. The number of
+        bytes of the head becomes 0, so that the next head is counted from its beginning.
         """
-        self._pending_bytes = 0
-        self._allow(self._limits.body_seconds)
-        self._previous_cycle = self.cycle
-        super().on_headers_complete()
+        self._head_bytes = 0
+        self._set_deadline(self._limits.body_seconds)
+        self._previous_cycle = self.cycle  # belongs to the request before this one
+        super().on_headers_complete()  # replaces `self.cycle` by a new object for this request and its response
         self.headers = []  # uvicorn adds trailers to this list, which the request no longer uses
         # If the client requests an upgrade, the parser ignores the body, and would read its later parts as a request.
         if self._is_stopping or self.parser.should_upgrade():
@@ -129,22 +139,22 @@ class Connection(HttpToolsProtocol):
 
     def on_body(self, body: bytes) -> None:
         """Pass a part of the body to the application, which limits the size of the body."""
-        self._pending_bytes = 0
+        self._head_bytes = 0
         super().on_body(body)
 
     def on_message_complete(self) -> None:
         """Remove the deadline, because the request is complete."""
-        self._is_reading = False
-        self._pending_bytes = 0
+        self._is_receiving = False
+        self._head_bytes = 0
         self.deadline = math.inf
         super().on_message_complete()
-        self.cycle.more_body = False  # uvicorn omits this if the request was already answered
+        self.cycle.more_body = False  # the body is complete; uvicorn omits this if the request was already answered
 
     def close_if_overdue(self, now: float) -> None:
         """End the connection if a deadline has passed. If a request has begun, the client receives the reason.
 
-        The method also sets the deadline of the next request, and the deadline until which the client must read a
-        response.
+        The server calls this method every 0.1 s. The method also sets the deadline of the next request, and the
+        deadline until which the client must read a response.
 
         Args:
             now: Present time on the clock of the event loop, s.
@@ -152,18 +162,19 @@ class Connection(HttpToolsProtocol):
         # If all requests are answered since the previous call, limit the time until the next request. This limit
         # replaces the timer of uvicorn, which a client could stop by an empty line, with which no request begins.
         if self.is_idle and self.deadline == math.inf:
-            self._allow(self._limits.idle_seconds)
-        # uvicorn pauses writing if the client does not read its responses. From then on, the deadline stays the same.
+            self._set_deadline(self._limits.idle_seconds)
+        # uvicorn pauses writing if the client does not read its responses. Until then, each call moves the deadline
+        # for reading them. The client must read the responses within `body_seconds` after writing was paused.
         if not self.flow.write_paused:
-            self._write_deadline = now + self._limits.body_seconds
+            self._response_deadline = now + self._limits.body_seconds
 
-        if min(self.deadline, self._write_deadline) > now:
+        if min(self.deadline, self._response_deadline) > now:
             return
-        if self._is_reading:
+        if self._is_receiving:
             # If the client does not read the refusal in time either, a later call aborts the connection.
-            self._is_reading = False
+            self._is_receiving = False
             self.refuse(408, "waited too long for the rest of the request")
-        else:
+        else:  # no request has begun, or it was already refused
             self.transport.abort()
 
     def shutdown(self) -> None:
@@ -171,29 +182,32 @@ class Connection(HttpToolsProtocol):
 
         A connection without an open request stays open for another 0.1 s, because its client may have sent a request
         that has not been read yet. The connection is then ended without waiting for the client. A normal end of a TLS
-        connection would wait for the client.
+        connection would wait for the client. This method calls itself after the 0.1 s.
         """
         if not self.is_idle or self.transport.get_write_buffer_size() > 0:
             super().shutdown()
-        elif self._is_stopping:
+        elif self._is_stopping:  # the second call
             self.transport.abort()
         else:
             self._is_stopping = True
             self.loop.call_later(0.1, self.shutdown)
 
-    def _close_after_responses(self) -> bool:
-        """Close the connection after the response to the latest complete request.
+    def _close_after_owed_response(self) -> bool:
+        """Let uvicorn close the connection after the response to the latest complete request.
+
+        If all complete requests are answered, nothing changes.
 
         Returns:
             Whether a complete request is not answered yet.
         """
+        # uvicorn calls a request and its response a cycle. `more_body` is True until the body is complete.
         is_incomplete = self.cycle is not None and self.cycle.more_body
         cycle = self._previous_cycle if is_incomplete else self.cycle
-        is_owed = cycle is not None and not cycle.response_complete
-        if is_owed:
-            cycle.keep_alive = False
-            self.deadline = math.inf
-        return is_owed
+        is_response_owed = cycle is not None and not cycle.response_complete
+        if is_response_owed:
+            cycle.keep_alive = False  # uvicorn closes the connection when the response is complete
+            self.deadline = math.inf  # no further data are expected
+        return is_response_owed
 
     def send_400_response(self, msg: str) -> None:
         """Refuse data that are not an HTTP request. uvicorn calls this method with a message."""
@@ -210,25 +224,28 @@ class Connection(HttpToolsProtocol):
             status: HTTP status.
             message: Reason of the refusal.
         """
-        if self.transport.is_closing() or self._close_after_responses():
+        # If a complete request is not answered yet, the called method lets its response close the connection.
+        if self.transport.is_closing() or self._close_after_owed_response():
             return
+        # Do not send a second response to a request that was answered before its body was complete.
         if self.cycle is not None and self.cycle.more_body and self.cycle.response_complete:
             self.transport.close()
             return
         body = orjson.dumps({"error": message})
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(body)
+        # The route "none" stands for a request that could not be read. The request begins and ends at the same time.
         self._traffic.count("http", "none", status, self.client, time.perf_counter_ns())
         self.transport.write(STATUS_LINE[status] + head + body)
-        self.transport.close()
-        self._allow(self._limits.header_seconds)  # the time in which the client must have received the refusal
+        self.transport.close()  # closes after the data have been sent
+        self._set_deadline(self._limits.header_seconds)  # the time in which the client must have received the refusal
 
 
-def _raise_file_limit(limits: ServerLimits) -> ServerLimits:
+def _limits_for_open_files(limits: ServerLimits) -> ServerLimits:
     """Let the process open as many files as the system permits, and return the limits that the server can then keep.
 
     Each connection needs an open file. The number of connections is reduced if it exceeds seven eighths of the number
-    of files. The remaining files are kept free. A server without a free file could not accept a new connection, and
-    could not end another connection in its favour.
+    of files. The remaining files are kept free, so that the server can always accept a new connection, and can then end
+    an older connection.
 
     Args:
         limits: Requested limits of the server.
@@ -265,7 +282,8 @@ class HttpServer(uvicorn.Server):
             InputError: If a TLS file cannot be used.
             ListenError: If the address is in use or cannot be used.
         """
-        limits = _raise_file_limit(application.limits)
+        # Permit more open files. If the system does not permit enough of them, the number of connections is reduced.
+        limits = _limits_for_open_files(application.limits)
         tls_context = tls.context() if tls else None
         self._address = address
         self._socket = address.listen()
@@ -284,6 +302,7 @@ class HttpServer(uvicorn.Server):
         )
         super().__init__(config)
         self.url = address.url(self._socket, secure=tls is not None)
+        # The metric of the open connections calls this function when the metrics are requested.
         application.traffic.open.labels("http").set_function(lambda: len(self.server_state.connections))
 
     def run(self, beside: AbstractAsyncContextManager[Any] | None = None) -> None:  # type: ignore[override]
@@ -293,13 +312,15 @@ class HttpServer(uvicorn.Server):
 
         Args:
             beside: Context that is open until `stop` is called, such as a gRPC server in the same event loop. If `stop`
-                is called again, the exit of the context is cancelled.
+                is called again, uvicorn ends `shutdown` without waiting, and the event loop then cancels the exit of
+                the context.
         """
 
         async def serve() -> None:
             """Open the context `beside`, which `shutdown` closes, and answer requests until the server is stopped."""
-            async with AsyncExitStack() as self._beside:
-                await self._beside.enter_async_context(beside or nullcontext())
+            # The method `shutdown` closes this stack, and thereby the context, before the block ends.
+            async with AsyncExitStack() as self._companion_stack:
+                await self._companion_stack.enter_async_context(beside or nullcontext())
                 await self.serve([self._socket])
 
         uvloop.run(serve())
@@ -320,7 +341,8 @@ class HttpServer(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:  # noqa: ARG002
         """End overdue connections, and return whether to stop the server. uvicorn calls this method every 0.1 s.
 
-        The method of the base class also updates the headers `date` and `server`, which the responses do not need.
+        The method of the base class is not called. It would also update the headers `date` and `server`, which the
+        responses do not need.
         """
         now = asyncio.get_running_loop().time()
         connections: Any = list(self.server_state.connections)
@@ -333,7 +355,7 @@ class HttpServer(uvicorn.Server):
 
         Meanwhile, the context that was passed to `run` is closed.
         """
-        closing = asyncio.create_task(self._beside.aclose())
+        closing = asyncio.create_task(self._companion_stack.aclose())
         self.server_state.tasks.add(closing)  # uvicorn waits for these tasks as long as for the requests
         closing.add_done_callback(self.server_state.tasks.discard)
         await super().shutdown(sockets)

@@ -64,7 +64,7 @@ class Application(ABC):
         if scope["type"] == "websocket":
             await send({"type": "websocket.close"})
             return
-        if scope["type"] == "lifespan":
+        if scope["type"] == "lifespan":  # the messages of the start and of the end of the program are only confirmed
             for event in ("startup", "shutdown"):
                 await receive()
                 await send({"type": f"lifespan.{event}.complete"})
@@ -75,7 +75,7 @@ class Application(ABC):
                 return
             path = scope["path"].removeprefix(scope.get("root_path", ""))  # the root path belongs to a mounting program
             request = (scope["method"], path, scope["headers"], body, scope.get("client"))
-            if path.startswith(self.blocking_paths):
+            if path.startswith(self.blocking_paths):  # a tuple of beginnings of paths
                 response = await asyncio.to_thread(self.answer, *request)
             else:  # most answers take only microseconds
                 response = self.answer(*request)
@@ -95,7 +95,7 @@ class Application(ABC):
             receive: Function that returns the next part of the request.
         """
         body = bytearray()
-        message: Message = {"more_body": True}
+        message: Message = {"more_body": True}  # as if a part of the body had been received and another part followed
         while message.get("more_body") and len(body) <= self.limits.body_bytes:
             message = await receive()
             if message["type"] == "http.disconnect":
@@ -125,6 +125,7 @@ class Application(ABC):
             response = self._check_and_answer(method, path, header_values(headers), body)
         except Exception as error:  # every error is sent to the client
             status, message = refusal(error)
+            # A RequestError may contain headers for the response.
             response = json_response({"error": message}, status, *getattr(error, "headers", ()))
         self.traffic.count("http", self._route_name(path), response.status, client, start_ns)
         return response
@@ -205,7 +206,7 @@ class Handler(Application):
         self.access = access or AccessCheck()
         self.limits = limits or ServerLimits()
         self.traffic = traffic or Traffic()
-        self.traffic.registry.register(store)
+        self.traffic.registry.register(store)  # the store provides the metrics of the models
 
     def _route_name(self, path: str) -> str:
         """Return the path of the route of a request. Requests with and without a version have the same name."""
@@ -214,7 +215,7 @@ class Handler(Application):
 
     def _check_and_answer(self, method: str, path: str, headers: Headers, body: bytes) -> Response:
         """Check a request, and answer it with the function of its route."""
-        route, model = match_path(path)
+        route, path_values = match_path(path)  # the values are the name and the version of the model, if any
         # The token is checked before unknown paths are refused. A client without the token therefore cannot find out
         # which paths exist.
         self.access.check(method, headers, needs_token=route.needs_token)
@@ -224,7 +225,7 @@ class Handler(Application):
         if method != "HEAD" or route.method != "GET":
             check_method(path, method, route.method)
         body = decompress(body, headers.get(b"content-encoding", b"").lower(), self.limits.body_bytes)
-        answer = route.respond(Request(self.store, self.traffic, headers, body, **model))
+        answer = route.respond(Request(self.store, self.traffic, headers, body, **path_values))
         return answer if isinstance(answer, Response) else json_response(answer)
 
 

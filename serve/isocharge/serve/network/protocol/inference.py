@@ -117,22 +117,22 @@ def _read_charges(tensor: InputTensor, binary: bytes, electrodes: tuple[str, ...
             f"input {INPUT!r}: expected the shape [n, {len(electrodes)}] with n > 0, "
             f"a column for each of {electrodes}, got {shape!r:.100}"
         )
-    if shape[0] > MAX_BATCH:
+    if shape[0] > MAX_BATCH:  # the HTTP status 413 means that the content is too large
         raise RequestError(f"input {INPUT!r}: expected at most {MAX_BATCH} presses in one request, got {shape[0]}", 413)
 
-    count = math.prod(shape)
+    number_count = math.prod(shape)
     dtype = np.dtype(DATATYPES[tensor.datatype])
     try:
         charges = np.frombuffer(binary, dtype) if tensor.data is None else np.asarray(tensor.data, np.float64)
     except ValueError:  # an incomplete number, or rows of different lengths
-        charges = np.empty(0)  # is refused below, because its shape is not accepted
-    is_sent_twice = binary and tensor.data is not None  # as a binary tensor and as a list
-    accepted_shapes = (tuple(shape), (count,))
+        charges = np.empty(0)  # an empty array is refused below, because its shape is not accepted
+    is_sent_twice = binary and tensor.data is not None  # as a binary tensor that is not empty, and as a list
+    accepted_shapes = (tuple(shape), (number_count,))  # in rows or flat
     if is_sent_twice or charges.shape not in accepted_shapes:
         raise RequestError(
-            f"input {INPUT!r}: expected {count} numbers for the shape {shape}, flat or in rows of equal length, or "
-            f"{count} binary numbers of {dtype.itemsize} bytes each, got an array of the shape {charges.shape} and "
-            f"{len(binary)} bytes"
+            f"input {INPUT!r}: expected {number_count} numbers for the shape {shape}, flat or in rows of equal length, "
+            f"or {number_count} binary numbers of {dtype.itemsize} bytes each, got an array of the shape "
+            f"{charges.shape} and {len(binary)} bytes"
         )
     return as_float32(charges.reshape(shape), electrodes)
 
@@ -156,7 +156,7 @@ def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, 
     charge_pC = _read_charges(body.inputs[0], binary, loaded.metadata.electrodes)
     contacts = loaded.predict_rows(charge_pC)
     misfits = contacts[:, COLUMNS["misfit"]]
-    alarm_count = np.count_nonzero(~(misfits <= loaded.validity.misfit_limit))  # also NaN
+    alarm_count = np.count_nonzero(~(misfits <= loaded.validity.misfit_limit))  # a NaN also counts as an alarm
     loaded.statistics.presses.inc(len(charge_pC))
     loaded.statistics.alarms.inc(float(alarm_count))
 
@@ -165,10 +165,11 @@ def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, 
         content["id"] = body.id
     content["outputs"] = []
     binary_tensors = []
-    is_binary_by_default = (body.parameters or {}).get("binary_data_output")
+    is_binary_by_default = (body.parameters or {}).get("binary_data_output")  # None, if not stated, means False
     for output in body.outputs or MODEL_OUTPUTS:
         name = output.name
-        tensor: Json = {"name": name, "datatype": "FP32", "shape": [len(charge_pC), OUTPUTS.get(name, 1)]}
+        column_count = OUTPUTS.get(name, 1)  # `OUTPUTS` does not contain the output `flags`, which has one column
+        tensor: Json = {"name": name, "datatype": "FP32", "shape": [len(charge_pC), column_count]}
         if name == FLAGS:
             flags_of_presses = loaded.validity.batch_flags(Contacts(*contacts.T))
             tensor["datatype"] = "BYTES"
@@ -176,6 +177,7 @@ def infer(loaded: LoadedVersion, body: InferBody, binary: bytes) -> tuple[Json, 
         else:
             tensor["data"] = contacts[:, COLUMNS[name]].ravel()
         if (output.parameters or {}).get("binary_data", is_binary_by_default):
+            # Move the values from the key `data` of the tensor into bytes, and state their size in the tensor.
             binary_tensors.append(_take_binary_tensor(tensor))
         content["outputs"].append(tensor)
     return content, binary_tensors

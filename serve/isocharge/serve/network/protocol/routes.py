@@ -186,19 +186,20 @@ def _infer(request: Request) -> Response:
 
     The body of the response is a JSON text, which may be followed by binary tensors.
     """
-    loaded = request.loaded
+    loaded_model = request.loaded
     if not request.body and b"upgrade" in request.headers:  # uvicorn discards the body of a request for an upgrade
         raise RequestError("Upgrade: this server reads no body after this header; set the client to HTTP/1.1")
-    # Without this header, no binary tensor follows the JSON text.
-    header_length = request.headers.get(b"inference-header-content-length", b"%d" % len(request.body))
-    with loaded.statistics.refused.count_exceptions(), loaded.statistics.latency.time():
-        body, binary = read_infer(request.body, header_length)
-        content, binary_tensors = infer(loaded, body, binary)
+    # Length of the JSON text in bytes. Without this header, the whole body is the JSON text.
+    json_length = request.headers.get(b"inference-header-content-length", b"%d" % len(request.body))
+    # An exception counts as a refused request.
+    with loaded_model.statistics.refused.count_exceptions(), loaded_model.statistics.latency.time():
+        body, binary = read_infer(request.body, json_length)
+        content, binary_tensors = infer(loaded_model, body, binary)
         response = json_response(content)
     if not binary_tensors:
         return response
-    json_length = (b"inference-header-content-length", b"%d" % len(response.body))
-    return response_of(200, b"application/octet-stream", b"".join([response.body, *binary_tensors]), json_length)
+    length_header = (b"inference-header-content-length", b"%d" % len(response.body))
+    return response_of(200, b"application/octet-stream", b"".join([response.body, *binary_tensors]), length_header)
 
 
 ROUTES = (
