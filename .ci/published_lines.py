@@ -33,7 +33,13 @@ PUBLISHED_LINES = {
 
 
 def main(tag: str, root: Path) -> None:
-    """Replace the lines in the files of a checkout.
+    """Replace the installation lines in the files of a checkout, as the table `PUBLISHED_LINES` states.
+
+    The table contains the new text for each old text, by the name of the file. A text that was replaced before remains.
+
+    Args:
+        tag: Tag of the release, such as "v1.2.0".
+        root: Folder of the checkout.
 
     Raises:
         SystemExit: If the tag is not the version in `pyproject.toml`, or a file contains neither form of a line.

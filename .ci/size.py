@@ -17,24 +17,42 @@ COLUMNS = ("modules", "nodes", "constants")
 
 
 def measure_module(path: Path) -> Counter[str]:
-    """Count the nodes and the numeric constants of one module."""
+    """Count the nodes and the numeric constants of one module.
+
+    Docstrings and the context nodes (Load, Store, Del) are not counted. A numeric constant is a number that is assigned
+    at the level of the module.
+
+    Returns:
+        The counts under the keys `COLUMNS`: "modules", which is 1, "nodes" and "constants".
+    """
     tree = ast.parse(path.read_text())
-    size = Counter(modules=1)
+    counts = Counter(modules=1)
     for node in ast.walk(tree):
         if _is_docstring(node):
-            size["nodes"] -= 1  # the text is a second node, which the loop counts
+            # A docstring is a statement node and a text node. The loop also reaches the text node and adds 1 for it.
+            # The two steps cancel, so that a docstring counts nothing.
+            counts["nodes"] -= 1
         elif not isinstance(node, ast.Load | ast.Store | ast.Del):
-            size["nodes"] += 1
+            counts["nodes"] += 1
     for statement in tree.body:
         if isinstance(statement, ast.Assign | ast.AnnAssign):
-            size["constants"] += _is_number(statement.value)
-    return size
+            counts["constants"] += _is_number(statement.value)  # adds 1 for True
+    return counts
 
 
 def measure_packages(root: Path = ROOT) -> dict[str, Counter[str]]:
-    """Return the size of each package, such as `simulate/forward`."""
+    """Return the numbers of modules, nodes and constants of each package, as `measure_module` counts them.
+
+    Deeper folders count as parts of their package.
+
+    Args:
+        root: Folder of the repository.
+
+    Returns:
+        Counts by the name of the package, such as "simulate/simulate/forward": a portion and at most two folders.
+    """
     packages: dict[str, Counter[str]] = {}
-    for portion in PORTIONS:
+    for portion in PORTIONS:  # the folders of the repository that contain a part of the source each
         source = root / portion / "isocharge"
         for path in sorted(source.rglob("*.py")):
             folders = path.relative_to(source).parts[:-1]
@@ -68,7 +86,7 @@ def _is_number(value: ast.expr | None) -> bool:
 def main() -> None:
     """Print one row for each package, the largest first, and the total."""
     packages = measure_packages()
-    rows = sorted(packages.items(), key=lambda item: -item[1]["nodes"])
+    rows = sorted(packages.items(), key=lambda item: -item[1]["nodes"])  # an item is a name and its counts
     print(f"{'package':40}" + "".join(f"{column:>12}" for column in COLUMNS))
     for name, size in [*rows, ("total", total_size(packages))]:
         print(f"{name:40}" + "".join(f"{size[column]:>12,}" for column in COLUMNS))

@@ -41,14 +41,15 @@ def _commands(group: Any, words: tuple[str, ...]) -> Iterator[tuple[tuple[str, .
     """Yield each command of a group and of its subgroups, together with the words that call this command.
 
     Args:
-        group: A group of Typer.
+        group: A group of Typer commands, which has the methods of a click group.
         words: Words that call the group, such as ("isocharge", "serve").
 
     Yields:
         Words of a command, and the command.
     """
-    for name in group.list_commands(None):
-        # Commands are imported only when they are needed. `resolve_command` imports the command.
+    for name in group.list_commands(None):  # the argument is a context, which these groups do not use
+        # Commands are imported only when they are needed. `resolve_command` imports the command that the first argument
+        # names, and also returns the arguments after this name.
         _name, command, _remaining_args = group.resolve_command(None, [name])
         is_group = hasattr(command, "list_commands")
         if is_group:

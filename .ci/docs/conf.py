@@ -131,10 +131,11 @@ def setup(app: Any) -> None:
     reference.write_pages(module_names, ROOT / REFERENCE)
     commands.write_page(ROOT / f"{COMMANDS}.md")
 
-    # A function with a smaller priority runs earlier. Napoleon, with the priority 500, must run after the conversion of
-    # plain text to reStructuredText, and before the attributes are listed.
+    # A function with a smaller priority runs earlier, and the default is 500. Napoleon, an extension of Sphinx that
+    # converts sections such as `Args`, has the priority 500. It must run after the conversion of plain text to
+    # reStructuredText, and before the attributes are listed.
     app.connect("source-read", add_contents)
-    app.connect("autodoc-skip-member", reference.is_of_scikit_learn)
+    app.connect("autodoc-skip-member", reference.is_of_scikit_learn)  # omits the methods of scikit-learn
     app.connect("autodoc-process-docstring", reference.plain_text, priority=400)
     app.connect("autodoc-process-docstring", reference.list_attributes, priority=600)
     app.connect("html-page-context", share_navigation, priority=400)  # before the theme requests the navigation

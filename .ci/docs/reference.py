@@ -99,7 +99,7 @@ def is_of_scikit_learn(_app: Any, _kind: str, name: str, _object: Any, skip: boo
 
 
 def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, lines: list[str]) -> None:
-    """Convert a docstring from plain text, in which names are in backticks, to reStructuredText.
+    """Convert a docstring of plain text, in which names are in backticks, to reStructuredText.
 
     Indented lines after a blank line become a block of code, which ends before the next line that is not indented.
     Sphinx calls this function for each docstring and expects the result in the same list.
@@ -110,7 +110,7 @@ def plain_text(_app: Any, kind: str, _name: str, _object: Any, _options: Any, li
     """
     converted = []
     is_code = False
-    for previous_line, line in zip(["", *lines], lines, strict=False):
+    for previous_line, line in zip(["", *lines], lines, strict=False):  # the first line has no previous line
         if line.strip():  # a blank line does not end the code
             was_code = is_code
             follows_blank_line = not previous_line.strip()
@@ -140,7 +140,8 @@ def list_attributes(_app: Any, _kind: str, _name: str, _object: Any, _options: A
         if line.startswith(":vartype "):
             continue
         attribute = ATTRIBUTE.match(line)
-        continues_description = not line.strip() or line.startswith(" ")  # of the previous attribute
+        # A blank or indented line belongs to the description of the previous attribute.
+        continues_description = not line.strip() or line.startswith(" ")
         if attribute is not None:
             if not is_in_list:
                 converted += [":Attributes:", ""]
