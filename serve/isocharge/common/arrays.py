@@ -62,5 +62,7 @@ def npz_arrays(data: bytes) -> dict[str, np.ndarray]:
             raise ValueError(f"the arrays unpack to more than {MAX_FILE_BYTES} bytes")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: np.asarray(content) for name, content in arrays.items()}
-    except Exception as error:  # zipfile, zlib and NumPy raise many types of exceptions for damaged files
+    except Exception as error:
+        # zipfile, zlib and NumPy raise many types of exceptions for damaged files. All of them, also the two errors
+        # above, are raised again as ValueError with the same message.
         raise ValueError(str(error) or type(error).__name__) from error

@@ -270,7 +270,8 @@ def require(*extras: str) -> Iterator[None]:
     """If an import in the `with` block fails, raise an error with the command that installs the extras.
 
     Args:
-        extras: Names of the extras in pyproject.toml. Without extras, no error is changed.
+        extras: Names of the extras in pyproject.toml, which are groups of optional packages. If no extras are given,
+            the errors of the block are not changed.
 
     Raises:
         MissingExtra: If an import in the block fails because a package other than isocharge is not installed. If an
@@ -326,11 +327,15 @@ def lazy_names(package: str, *extras: str) -> tuple[Callable[[str], Any], Callab
     """
     source = pkgutil.get_data(package, "__init__.py") or b""
     imports = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.ImportFrom)]
+    # Only a public name has an `asname`, which is the name after `as`.
     module_by_name = {alias.name: node.module or "" for node in imports for alias in node.names if alias.asname}
     public_names = sorted(module_by_name)
 
     def import_public_name(name: str) -> Any:
         """Import a public name, and store it in the package. Python then does not call this function for it again.
+
+        The enclosing function `lazy_names` provides the name `package` of the package, the `extras` that the package
+        needs, and the module of each public name (`module_by_name`).
 
         Raises:
             AttributeError: If the name is not public.

@@ -230,14 +230,17 @@ def new_folder(path: Path) -> Iterator[Path]:
         OutputExists: If `path` exists already, or another process creates it in the meantime.
         OutputError: If the folder cannot be written.
     """
-    missing_parents = [parent for parent in path.parents if not os.path.lexists(parent)]
+    missing_parents = [parent for parent in path.parents if not os.path.lexists(parent)]  # the deepest one first
     try:
+        # `new_file` chooses the temporary path. At the end, it renames or removes the folder that is created there.
         with new_file(path) as temporary_path:
             temporary_path.mkdir(parents=True)
             yield temporary_path
     finally:
+        # After an error, remove the parents that were created. Otherwise, they contain the new folder, and `rmdir`
+        # fails because they are not empty.
         for parent in missing_parents:
-            with suppress(OSError):  # without an error, the parent contains the new folder
+            with suppress(OSError):
                 parent.rmdir()
 
 

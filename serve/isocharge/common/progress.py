@@ -78,7 +78,8 @@ def second_thread(shown_title: str | None = None) -> Iterator[Executor]:
         if listener:
             listener(shown_title or title, done, total, note)
 
-    # The listener is a context variable, which a new thread does not inherit. The initializer sets it in the thread.
+    # The listener is a context variable, which a new thread does not inherit. The executor therefore calls
+    # `_listener.set(report_unless_failed)` in its new thread.
     with ThreadPoolExecutor(1, initializer=_listener.set, initargs=(report_unless_failed,)) as executor:
         try:
             yield executor

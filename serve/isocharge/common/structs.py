@@ -152,6 +152,7 @@ def parse_json(text: str | bytes, where: str, error_class: type[InputError], tar
         return msgspec.json.decode(text, type=target_type)
     except (ValueError, RecursionError) as cause:
         # The text is either not JSON, or JSON with wrong content. Decoding without a type distinguishes the two cases.
+        # If it also fails, the text is not JSON, and the first error `cause` states why.
         try:
             content = msgspec.json.decode(text)
         except (ValueError, RecursionError):
@@ -218,7 +219,7 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
         try:
             item = value[key]
             msgspec.convert(item, item_type)
-        except LookupError:  # the table need not have this key
+        except LookupError:  # the value has no such item; if the item is required, `error` reports that it is missing
             continue
         except msgspec.ValidationError as item_error:
             item_path = f"{path}[{key}]" if isinstance(key, int) else _join(path, key)
@@ -227,14 +228,15 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     cause = error.__cause__
     if isinstance(cause, WrongKey):
         key_path = _join(path, cause.key)
+        # A `WrongKey` without a message means that the key is missing.
         return f"{key_path}: {cause}" if str(cause) else f"key {key_path!r} is missing"
 
-    key_error = _KEY_ERROR.match(str(error))
-    if key_error is None:  # the value has a wrong type, or is beyond its bounds
+    key_mistake = _KEY_ERROR.match(str(error))  # matches only a message about a missing or unknown key of a struct
+    if key_mistake is None:  # the value has a wrong type, or is beyond its bounds
         expected = _describe_schema(msgspec.json.schema(expected_type))
         return f"{_prefix(path)}expected {expected}, got {shown(value)}"
 
-    kind, name = key_error.groups()
+    kind, name = key_mistake.groups()
     if kind == "missing required":
         return f"key {_join(path, name)!r} is missing"
 
@@ -245,21 +247,21 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
 
 
 def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
-    """Return the types of the items that a table or a list may have, by their keys or indices.
+    """Return the expected type of each item of a table (by its key) or of a list (by its index).
 
-    A struct is a class that declares the keys of a table. If several structs are possible, the table has a key that
-    states which of them applies. The value of this key is called the tag.
+    The result also contains keys that the table may have but does not have.
 
     Args:
-        value: Value from TOML or JSON. If the value is neither a table nor a list, the result is empty.
-        expected_type: Type that the value may have.
+        value: Table or list from TOML or JSON. For any other value, the result is empty.
+        expected_type: Type that the value should have. It may be a union of several types.
     """
-    members = list(_union_members(expected_type))
-    structs = [member for member in members if isinstance(member, type) and issubclass(member, Struct)]
+    alternatives = list(_union_members(expected_type))
+    # A struct is a class whose attributes are the keys of a table.
+    structs = [member for member in alternatives if isinstance(member, type) and issubclass(member, Struct)]
     types: dict[str | int, Any] = {}
     if isinstance(value, Mapping):
-        types |= _field_types(value, structs)
-    for member in members:  # the items of dictionaries, lists and tuples
+        types |= _types_by_key(value, structs)
+    for member in alternatives:  # add the types of the items of dictionaries, lists and tuples
         arguments = get_args(member)
         if isinstance(value, Mapping) and get_origin(member) is dict:
             _key_type, item_type = arguments
@@ -273,15 +275,18 @@ def _item_types(value: Any, expected_type: Any) -> dict[str | int, Any]:
     return types
 
 
-def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int, Any]:
-    """Return the types of the values that a table may have, by their keys, if structs declare these keys.
+def _types_by_key(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int, Any]:
+    """Return the type of the value of each key that a table may have, as the struct of the table declares it.
 
-    A struct declares the keys of the table if the struct has no tag, or if the table contains the tag of the struct.
-    The value of the tag key may be the tag of any of the structs.
+    A struct is a class whose attributes are the keys of a table. If several structs are possible, a key of the table
+    states which of them applies. This key is called the tag key, and its value is called the tag.
 
     Args:
         table: Table from TOML or JSON.
-        structs: Structs that may declare the keys. If there are several structs, all have the same tag key.
+        structs: Structs that may apply. If there are several structs, all have the same tag key.
+
+    Returns:
+        Types by key. All keys are texts. The caller adds the indices of lists, which are integers.
     """
     tags = tuple(struct.__struct_config__.tag for struct in structs)
     types: dict[str | int, Any] = {}
@@ -289,8 +294,8 @@ def _field_types(table: Mapping[str, Any], structs: list[Any]) -> dict[str | int
         config = struct.__struct_config__
         tag_key = config.tag_field  # None if the struct has no tag
         if tag_key is not None:
-            types[tag_key] = Literal[tags]
-        if tag_key is None or table.get(tag_key) == config.tag:
+            types[tag_key] = Literal[tags]  # the tag may be that of any of the structs
+        if tag_key is None or table.get(tag_key) == config.tag:  # this struct applies
             types |= {field.encode_name: field.type for field in msgspec.structs.fields(struct)}
     return types
 
@@ -308,7 +313,8 @@ def _union_members(expected_type: Any) -> Iterator[Any]:
         yield expected_type
         return
     arguments = get_args(expected_type)
-    for member in arguments[:1] if origin is Annotated else arguments:  # the annotations follow the type
+    # The arguments of a union are its members. Those of `Annotated` are one type and then its annotations.
+    for member in arguments[:1] if origin is Annotated else arguments:
         yield from _union_members(member)
 
 
@@ -329,7 +335,7 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
         schema: JSON schema that msgspec has derived from a type. If the annotation of the type contains a description,
             the schema contains this description, and the function returns this description.
     """
-    match schema:
+    match schema:  # the first case that matches is used, so special cases precede general ones
         case {"description": description}:
             return str(description)
         case {"enum": values}:
@@ -340,6 +346,7 @@ def _describe_schema(schema: Mapping[str, Any]) -> str:
             return " or ".join(dict.fromkeys(descriptions))  # `fromkeys` removes repeated descriptions
         # A tuple has a schema for each item in `prefixItems`, but its items are of one kind. A list has one schema.
         case {"prefixItems": [item, *_]} | {"items": item}:
+            # `_noun` returns the word for a kind of value, such as "number".
             items = f"{_noun(item)}s"
             minimum = schema.get("minItems", 0)
             if minimum == schema.get("maxItems"):
@@ -378,6 +385,7 @@ def _describe_number(noun: str, schema: Mapping[str, Any]) -> str:
         noun: Noun for the numbers: "number" or "whole number".
         schema: JSON schema that contains the bounds.
     """
+    # Word before each bound, such as "from 0 to below 1"
     words = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to", "exclusiveMaximum": "to below"}
     bounds = {}
     for key, word in words.items():

@@ -29,12 +29,13 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
     Raises:
         TypeError: If a value has another type.
     """
-    # An empty text becomes an empty comment line.
+    # An item of `comment` may have several lines. An empty item has none, and becomes an empty comment line.
     lines = [f"# {printable(line)}".rstrip() for text in comment for line in text.splitlines() or [""]]
     if lines:
         lines.append("")
 
     # Keys without a table must precede all tables, because TOML assigns later keys to the last table.
+    # `_pair` returns a line "key = value".
     lines += [_pair(key, value) for key, value in tables.items() if not isinstance(value, Mapping)]
 
     for name, table in tables.items():
@@ -46,7 +47,7 @@ def to_toml(tables: Mapping[str, Any], comment: Iterable[str] = ()) -> str:
 
 def _pair(key: str, value: object) -> str:
     """Return a key and its value in the notation of TOML."""
-    return f"{toml_key(key)} = {_value(value)}"
+    return f"{toml_key(key)} = {_toml_value(value)}"
 
 
 def toml_key(key: str) -> str:
@@ -54,8 +55,10 @@ def toml_key(key: str) -> str:
     return key if _BARE_KEY.fullmatch(key) else _json(key)
 
 
-def _value(value: object) -> str:
-    """Return a value in the notation of TOML.
+def _toml_value(value: object) -> str:
+    """Return a value in the notation of TOML. A table becomes an inline table, such as `{a = 1, b = 2}`.
+
+    `_pair` writes a key and a value of the table, and `_json` writes a text or a truth value.
 
     Args:
         value: Text, number, truth value, list, tuple or table.
@@ -66,7 +69,7 @@ def _value(value: object) -> str:
     if isinstance(value, Mapping):
         return "{" + ", ".join(_pair(key, item) for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
+        return "[" + ", ".join(map(_toml_value, value)) + "]"
     if isinstance(value, bool | str):  # before the numbers, because bool is a subclass of int
         return _json(value)
     if isinstance(value, int | float):
