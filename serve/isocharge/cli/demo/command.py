@@ -41,7 +41,7 @@ def demo_command(
 
     Example: isocharge demo -o first-light
     """
-    # At least two of the three options must be missing.
+    # At most one of the three options may be given, so at least two are None.
     if [output, live, playground].count(None) < 2:
         raise InputError("expected only one of --output, --live and --playground, got several")
     if playground is not None:

@@ -60,6 +60,7 @@ def run_demo(folder: Path) -> None:
         draw_page(forward_map, equilibrium, followed, draft / "demo.png")
     say(f"   {folder / 'demo.png'}")
 
+    # `followed` has the shape (n, 2, 3): for each frame, the true and the estimated contact (x, y, F).
     true_contacts = followed[:, 0]
     estimated_contacts = followed[:, 1]
     live_median_mm, live_p95_mm = np.percentile(position_error(estimated_contacts, true_contacts), (50, 95))
@@ -83,13 +84,14 @@ def _follow_live(forward_map: ForwardMap, predictor: Predictor) -> Array:
         The true and the estimated contact (x, y, F) of each frame in which both exist, shape (n, 2, 3), mm and N.
     """
     touch = TouchStream(predictor)
-    followed = []
+    followed = []  # pairs of a true and an estimated contact
     with virtual_sensor(forward_map) as sensor, Port(sensor.url) as port:
         all_records = (record for chunk in port for record in touch.feed(chunk))
         records = islice(all_records, FOLLOWED_FRAMES)
         script = sensor.script
         for record in track(records, "following", FOLLOWED_FRAMES):
-            # The script that the virtual sensor repeats contains the true press of this frame.
+            # The virtual sensor repeats a script, which has one row with the true contact for each frame. The time of
+            # the frame gives its number since the start. The remainder is its row in the script.
             row = round(1e-6 * (record.t_device_us or 0) * script.rate_Hz) % len(script.contact)
             if record.contact and script.touching[row]:
                 followed.append((script.contact[row], (record.x_mm, record.y_mm, record.force_N)))

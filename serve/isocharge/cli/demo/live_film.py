@@ -29,4 +29,5 @@ def show_live_film(live: str, token: str | None) -> None:
             )
         with virtual_sensor(forward_map) as board:
             say("Ctrl-C stops")
+            # The released model has the name of its sensor. No records are written, and only the page shows contacts.
             stream_command(DEMO_SENSOR, board.url, output=["none"], live=live, token=token)

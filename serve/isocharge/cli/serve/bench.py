@@ -27,6 +27,8 @@ def bench_command(
     """
     loaded = load_checked_model(find_model(model, models))
     predictor = Predictor(loaded.folder)
+    # A contender is one way to compute contacts, such as a method for one press or for a batch. The golden vectors are
+    # charges that are stored with the model. `press_charges` repeats them to fill the largest batch.
     contenders = in_process_contenders(predictor, press_charges(predictor, loaded.golden.charge_pC))
     with shown_progress():
         timings = take_turns(contenders, seconds)

@@ -46,15 +46,17 @@ def check_command(
     check = check_presses(predictor, presses)
     result = check.to_dict()
     if not json:
-        each_press = result.pop("each")
+        # For people, print two tables before the other values: a short table of the presses ("each"), and a table of
+        # the errors of the positions and of the forces ("errors").
+        press_rows = result.pop("each")
         summaries = {name: result.pop(name) for name in ("position_mm", "force_percent")}
-        errors = {name: summary for name, summary in summaries.items() if summary is not None}
-        # The table contains the presses with the largest errors, in the order of the file.
+        known_summaries = {name: summary for name, summary in summaries.items() if summary is not None}
+        # The short table contains the presses with the largest errors, in the order of the file. Its columns are SHOWN.
         worst_indices = np.argsort(-check.errors.chi_squared, kind="stable")[:MAX_ROWS]
         if check.presses > MAX_ROWS:
             say(f"the table has the {MAX_ROWS} worst of {check.presses} presses; --json has all")
-        rows = [{name: each_press[index][name] for name in SHOWN} for index in sorted(worst_indices)]
-        result = {"each": rows, "errors": errors} | result
+        shown_rows = [{name: press_rows[index][name] for name in SHOWN} for index in sorted(worst_indices)]
+        result = {"each": shown_rows, "errors": known_summaries} | result
         if check.std_factor is not None:
             result["std_factor"] = f"{check.std_factor.statement}, if they were not used for the model"
     show_result(result, json=json)

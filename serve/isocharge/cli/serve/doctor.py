@@ -150,8 +150,8 @@ def _electrodes_of(model: str | None, models: Path | None) -> tuple[str, ...]:
     """Return the names of the electrodes for which the channels of a board are searched.
 
     Args:
-        model: Value of `--model`: a model, a sensor file if the film has no model yet, or None. If the value is None,
-            no names are returned, and the board may use any names.
+        model: Value of `--model`: a model, a sensor file if the film has no model yet, or None. If the value is None or
+            empty, the result is empty, and the board may use any names.
         models: Value of `--models`.
     """
     if not model:
@@ -174,7 +174,8 @@ def _check_wiring(examination: Examination) -> ElectrodeCheck:
     """
     table = dict(examination.device)
     if examination.unit != "pC":
-        # The charge of one unit is unknown. A section `[gain]` with only the offsets would be refused.
+        # The board sends another unit, whose charge in pC is unknown. The section `[gain]` would then contain only the
+        # offsets, and such a section is refused. The check works without it, in the unit of the board.
         table.pop("gain", None)
     device = device_from_table(table, "board")
     # Without a section `[channels]`, each electrode has the channel that the port check has found by names or order.

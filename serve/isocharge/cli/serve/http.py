@@ -83,6 +83,8 @@ def http_command(
         store = ModelStore(models)
         handler = Handler(store, traffic=traffic, access=access)
         server = HttpServer(handler, address, tls)
+        # SIGHUP loads all models again, in a thread, so that the server continues to answer. The system also sends
+        # SIGHUP when the terminal is closed. In this case, `unless_hung_up` stops the server instead.
         load_all = unless_hung_up(lambda: threading.Thread(target=_load_all, args=[store], name="load").start())
         with (
             closing(server),
@@ -91,7 +93,8 @@ def http_command(
             on_signal(signal.SIGHUP, load_all),
         ):
             _log_models(store)
-            server.run(beside=_announced(server, handler, host, grpc_port, tls))
+            # The context manager `beside` runs the gRPC server at the same time, and prints the addresses.
+            server.run(beside=_grpc_server_and_urls(server, handler, host, grpc_port, tls))
 
 
 def _log_models(store: ModelStore) -> None:
@@ -119,7 +122,8 @@ def _traffic(log_format: str) -> Iterator[Traffic]:
     """Context manager that yields the traffic counters of the servers and, for `--log json`, writes a log of requests.
 
     A separate thread writes the log to stderr, so that a slow reader of stderr does not delay the answers. The warnings
-    of all packages are written to the same log. For `--log text`, there is no log.
+    of all packages are written to the same log. For `--log text`, there is no log. The settings of the module `logging`
+    are not restored at the end, because the command ends then.
 
     Args:
         log_format: Value of `--log`.
@@ -138,10 +142,11 @@ def _traffic(log_format: str) -> Iterator[Traffic]:
 
 
 @asynccontextmanager
-async def _announced(
+async def _grpc_server_and_urls(
     server: HttpServer, handler: Handler, host: str, grpc_port: int | None, tls: Tls | None
 ) -> AsyncIterator[None]:
-    """Context manager that runs the gRPC server, and prints the addresses of the HTTP server and of the gRPC server.
+    """Context manager that prints the address of the HTTP server. If a port for gRPC is given, the context manager also
+    runs the gRPC server during its block, and prints the address of the gRPC server.
 
     Args:
         server: The HTTP server.

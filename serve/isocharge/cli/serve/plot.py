@@ -55,7 +55,8 @@ def recorded_samples(recording: Recording, where: str) -> Samples:
     first = next(records, None)
     if first is None:
         raise RecordingError(f"{where}: expected at least one record, got none; replay or record it again")
-    electrodes = tuple(first.charge_raw_pC or ())
+    electrodes = tuple(first.charge_raw_pC or ())  # the keys are the names of the electrodes
+    # A row has the numbers of one record, in the order of the fields that `sample_type` declares.
     rows = (sample_values(record, electrodes) for record in chain([first], records))
     return np.fromiter(rows, sample_type(electrodes))
 

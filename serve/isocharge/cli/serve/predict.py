@@ -37,7 +37,8 @@ def predict_command(
     """
     predictor = Predictor(model, models=models)
     if device is not None:
-        from isocharge.serve.live.device import load_device, predictor_for  # imports all stages of a stream
+        # This late import loads all stages of a stream, for which a command without --device need not wait.
+        from isocharge.serve.live.device import load_device, predictor_for
 
         predictor = predictor_for(load_device(device), predictor)
     charge_pC = read_charges(file, predictor.metadata.electrodes)

@@ -84,7 +84,8 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
         writers: Functions that write a record. The functions are called in the given order.
     """
     is_tare_printed = False
-    untared_pC: Mapping[str, float | None] | None = None  # latest charges while the tare is measured, otherwise None
+    # Latest charges while the tare is measured, otherwise None. They are printed at the end of a stream without a tare.
+    untared_pC: Mapping[str, float | None] | None = None
     try:
         for record in records:
             for write in writers:
@@ -97,7 +98,7 @@ def write_records(records: Iterable[PredictionRecord], writers: Iterable[Callabl
                 untared_pC = None
                 say(f"tared: {_listed(record.tare_pC)}")
     except Exception:
-        untared_pC = None  # the error states itself why the stream has ended
+        untared_pC = None  # the error states why the stream has ended, so that `finally` prints nothing
         raise
     finally:  # also after Ctrl-C
         if untared_pC:
@@ -332,11 +333,14 @@ def replay_command(
     predictor = Predictor(folder)
     board = load_device(device) if device else device_from_table(recording.device, str(file))
 
-    # The function `play` yields the records. If the model was changed during the recording, `play` changes the model,
-    # too, unless the user has chosen one model for the whole recording.
-    touch = TouchStream(predictor, board, frame_id=recording.name)
-    load = None if model else lambda label: Predictor(find_labelled_model(label, models))
-    play = partial(replay, recording, touch, real_time=real_time, yields_all=bool(device), load=load)
+    # If the model was changed during the recording, the replay changes the model, too. It then calls
+    # `load_changed_model` with the label of the new model. A model that the user has chosen is never changed.
+    touch = TouchStream(predictor, board, frame_id=recording.name)  # `recording.name` is the name of the film
+    load_changed_model = None if model else lambda label: Predictor(find_labelled_model(label, models))
+
+    # The function `play` yields the records. Without --device, it yields as many records as the recording contains.
+    # Another description of the board may give more frames, so `yields_all` then requests all records.
+    play = partial(replay, recording, touch, real_time=real_time, yields_all=bool(device), load=load_changed_model)
 
     outputs = command_outputs(output, touch, is_live=False)
     with (
@@ -363,6 +367,6 @@ def replay_command(
             page.update(is_complete=True)
             threading.Event().wait()  # sleeps until Ctrl-C, because nothing sets the event
     say(summary(touch))
-    if outputs.has_incomplete_file:
+    if outputs.has_incomplete_file:  # the replay was stopped before its end, for example by Ctrl-C
         say_missing_records(outputs, "not written, because the replay was stopped before its end")
         raise typer.Exit(1)

@@ -67,7 +67,8 @@ def sweep_radius(
     """Return the radius of a sweep, mm.
 
     Args:
-        text: Value of `--radius`: a number, or `auto` for the radius of the smallest working area of the probes.
+        text: Value of `--radius`: a number, or `auto` for the radius of the smallest working area of the probes. A
+            number is returned as it is, so the caller must check its range.
         sensor: The sensor.
         probes: The probes.
         force: Smallest and largest force, N.
@@ -109,7 +110,7 @@ def warn_of_stress(film: Film, probes: Iterable[Probe], max_force: float) -> Non
         probes: The probes.
         max_force: Largest force, N.
     """
-    from isocharge.simulate.solver.stress_limit import stress_caution
+    from isocharge.simulate.solver.stress_limit import stress_caution  # imported late, because it loads the solver
 
     for probe in probes:
         with suppress(IsochargeError):  # the caller computes the same press later, and then reports the error
@@ -129,7 +130,10 @@ trained on fewer presses have larger errors near the rim of the working area."""
 def simulated_presses(
     sensor: Sensor, probes: Sequence[Probe], radius: float, executor: Executor | None = None
 ) -> Dataset:
-    """Simulate presses with the default settings of a sweep, and with its default range of forces.
+    """Simulate presses with the default settings of a sweep, except for its radius and its number of presses.
+
+    A sensor with few electrodes gets `N_SIMULATED_PRESSES` presses. A sensor with more electrodes has a larger working
+    area, and gets four times as many.
 
     Args:
         sensor: The sensor.

@@ -25,24 +25,29 @@ def lazy_group(summary: str, summaries: Mapping[str, str]) -> typer.Typer:
             function determines the name of the command, here `export-c`. The command always needs the extra of
             pyproject.toml in square brackets, here `train`.
     """
-    functions = {path.partition(":")[2].partition("_command")[0].replace("_", "-"): path for path in summaries}
+    # Entry points by the names of the commands. For example, the command `export-c` has the entry point
+    # "train.export_c:export_c_command [train]": the text between ":" and "_command" becomes the name.
+    entry_points = {
+        entry_point.partition(":")[2].partition("_command")[0].replace("_", "-"): entry_point
+        for entry_point in summaries
+    }
 
     # Typer creates the object of the group itself and accepts only a class. The class is therefore defined here, where
-    # its methods can use `functions`.
+    # its methods can use `entry_points`.
     class LazyGroup(TyperGroup):
         """A group that stores only the names and the summaries of its commands."""
 
         def __init__(self, **settings: Any) -> None:
             """Add a placeholder for each command. The help of the placeholder is the summary of the command."""
             super().__init__(**settings)
-            for name, path in functions.items():
-                self.add_command(TyperCommand(name, help=summaries[path], short_help=summaries[path]))
+            for name, entry_point in entry_points.items():
+                self.add_command(TyperCommand(name, help=summaries[entry_point], short_help=summaries[entry_point]))
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
             """Import the command that the arguments name. Return this command instead of its placeholder."""
             name, command, remaining_args = super().resolve_command(ctx, args)
-            if name in functions:
-                command = load_command(functions[name])
+            if name in entry_points:
+                command = load_command(entry_points[name])
             return name, command, remaining_args
 
     return typer.Typer(
@@ -59,7 +64,8 @@ def load_command(path: str) -> TyperCommand:
     """Import the function of a command, and return the Typer command for this function.
 
     Args:
-        path: The function, as in the argument `summaries` of `lazy_group`.
+        path: Module in the folder `cli`, function and extra of the command, in the notation of entry points. An example
+            is "train.export_c:export_c_command [train]".
 
     Raises:
         MissingExtra: If the extra of the command is not installed.

@@ -75,6 +75,8 @@ TlsKeyOption = Annotated[
 def given_tls(certificate: Path | None, key: Path | None) -> Tls | None:
     """Return the TLS files in the options, or None if no certificate is given.
 
+    If only the certificate is given, its file must also contain the key.
+
     Args:
         certificate: Value of `--tls-cert`; None if the option is not given.
         key: Value of `--tls-key`; None if the option is not given.
@@ -123,7 +125,7 @@ def live_page(
 
     Args:
         live: Value of `--live`; None if the option is not given.
-        name: Name of the stream, which the page shows.
+        name: Name of the film or of the recording, which the page shows.
         metadata: Metadata of the model that estimates the contacts.
         is_recording: Whether the stream is a recording.
         token: Value of `--token`.
@@ -176,40 +178,44 @@ class PageFeed:
 
         Args:
             page: The page.
-            touch: The stream whose records are passed to the page.
-            stream: The same stream together with its recording. The page controls this stream, for example to measure a
-                new tare. None for a replay, which cannot be controlled.
+            touch: The stream that computes the records. Its counters and its model are shown on the page.
+            stream: Object that records `touch` and executes requests, for example to measure a new tare. None for a
+                replay, which cannot be controlled.
             new_recorder: Function that creates a recorder from the path of the recording and the label of the model.
                 The function is called when the page begins a recording. None if the page cannot begin a recording.
         """
         self._page = page
         self._touch = touch
-        self._stream = stream
-        self._new_recorder = new_recorder
+        self._controlled_stream = stream
+        self._create_recorder = new_recorder
         self._is_recording = False  # whether the page has begun a recording
-        self._last_state_s = 0.0
+        self._last_state_update_s = 0.0  # monotonic time at which the state was last sent to the page, s
         self._latest_record: PredictionRecord | None = None
         if stream is not None:
-            page.act = partial(self._carry_out, stream)
+            page.act = partial(self._handle_button, stream)  # is called for each request that changes the stream
 
     def write(self, record: PredictionRecord) -> None:
         """Add a record to the page. From time to time, also update the state of the stream."""
         self._page.add(record)
         self._latest_record = record
         now_s = time.monotonic()
-        if now_s - self._last_state_s > STATE_INTERVAL_S:
-            self._last_state_s = now_s
+        if now_s - self._last_state_update_s > STATE_INTERVAL_S:
+            self._last_state_update_s = now_s
             self.update_state()
 
     def update_state(self) -> None:
-        """Update the counters and the state of the stream on the page, unless the stream has no record yet."""
+        """Update the counters and the state of the stream on the page, unless the stream has no record yet.
+
+        The state contains the counts of frames and faults, the rate, the model, the followed pretension of the film,
+        the tare, the name of the recording, and whether the recording has failed.
+        """
         record = self._latest_record
         if record is None:
             return
-        recorder = self._stream.recorder if self._stream else None
+        recorder = self._controlled_stream.recorder if self._controlled_stream else None
         self._page.update(
             counters=asdict(self._touch.parser.counts),
-            rate_Hz=self._page.tape.rate_Hz(),
+            rate_Hz=self._page.tape.rate_Hz(),  # the tape contains the samples of the page
             model=record.model,
             film=None if record.film is None else structs.asdict(record.film),
             tare_pC=record.tare_pC,
@@ -217,8 +223,13 @@ class PageFeed:
             recording_failed=recorder is not None and recorder.failed,
         )
 
-    def _carry_out(self, stream: RecordedStream, action: "Action") -> None:
+    def _handle_button(self, stream: RecordedStream, action: "Action") -> None:
         """Carry out a request of the page to write a marker, to begin or end a recording, or to measure a new tare.
+
+        Args:
+            stream: The stream that the page controls.
+            action: Request of the class `Marker`, `Tare` or `Record`. A `Record` begins a recording if its attribute
+                `on` is true, and otherwise ends the recording.
 
         Raises:
             InputError: If the page requests a recording while the stream is already recorded, even if another browser
@@ -228,17 +239,20 @@ class PageFeed:
         from isocharge.serve.viewer.live_page import Marker, Tare
 
         if isinstance(action, Marker):
+            # `recording.Marker` is another class: the marker in a recording, which also has a time.
             marker = recording.Marker(time.time(), action.text)
             stream.request_marker(marker)
             self._page.add_marker(marker)
         elif isinstance(action, Tare):
             stream.request_tare()
-        elif self._new_recorder is None or (action.on and self._is_recording):
+        # Below, the action is a `Record`. Without a function that creates recorders, the command itself records the
+        # stream, and the page may neither begin nor end a recording.
+        elif self._create_recorder is None or (action.on and self._is_recording):
             raise InputError("the command that runs the stream (--record), or another browser, records it already")
         elif action.on:
             model_label = self._touch.predictor.metadata.label
             path = Path(f"{model_label.replace('/', '-')}-{datetime.now():%Y%m%d-%H%M%S-%f}.rec")
-            stream.request_recording(self._new_recorder(path, model_label))
+            stream.request_recording(self._create_recorder(path, model_label))
             self._is_recording = True
             self._page.update(recording=f"{path.name}, which waits for data")
         else:

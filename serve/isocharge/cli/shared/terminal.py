@@ -83,7 +83,7 @@ def show_result(result: Mapping[str, Any], *, json: bool = False) -> None:
 
     values: Any = plain_values(result)
     width = max(map(len, values))
-    next_line = "\n" + " " * (width + 2)
+    next_line = "\n" + " " * (width + 2)  # the values begin two blanks after the longest name
     for name, value in values.items():
         rows = _table_rows(value)
         if rows:
@@ -116,13 +116,14 @@ def _value_text(value: Any, separator: str = ", ") -> str:
 
     Args:
         value: Number, text, None, or a list or dictionary of such values.
-        separator: Text between the items of a dictionary or of a list of texts.
+        separator: Text between the items of a dictionary or of a list of texts. Inner lists and dictionaries are
+            separated by commas.
     """
     if value is None:
         return "-"
     if isinstance(value, float):
-        # A number has five significant digits. From 1e5 on, the format `.5g` would write an exponent, so numbers of at
-        # least five digits before the decimal point are rounded to whole numbers, up to 1e9.
+        # A number has five significant digits. The format `.5g` writes an exponent if they round to 1e5 or more.
+        # Numbers from 1e4 to 1e9 are therefore rounded to whole numbers instead.
         is_large = 1e4 <= abs(value) < 1e9
         return f"{value:.0f}" if is_large else f"{value:.5g}"
     if isinstance(value, dict):
@@ -273,9 +274,17 @@ def warnings_to_stderr() -> Iterator[None]:
 
 @contextmanager
 def warnings_passed_to(write: Callable[[logging.LogRecord], None], package: str) -> Iterator[None]:
-    """Context manager that calls a function with each warning of a package and of its subpackages."""
+    """Context manager that calls a function with each warning and each error that a package logs.
+
+    The messages of subpackages are included. Messages below the level of a warning do not arrive, unless the program
+    has set a lower level for a logger.
+
+    Args:
+        write: Function that is called with each log record.
+        package: Name of the package.
+    """
     handler = logging.Handler()
-    handler.emit = write  # type: ignore[method-assign, assignment]
+    handler.emit = write  # type: ignore[method-assign, assignment]  # `logging` calls `emit` with each log record
     logger = logging.getLogger(package)
     logger.addHandler(handler)
     try:
@@ -301,7 +310,7 @@ def shown_progress() -> Iterator[None]:
     console = Console(stderr=True, markup=False, emoji=False)
     with Progress(*Progress.get_default_columns(), "{task.fields[note]}", console=console, transient=True) as bars:
 
-        @cache
+        @cache  # returns the same bar for the same title
         def bar_of(title: str) -> TaskID:
             """Return the bar with the given title. The first call with a title creates the bar."""
             return bars.add_task(title, total=None, note="")

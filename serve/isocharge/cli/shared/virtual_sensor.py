@@ -15,8 +15,9 @@ PRESSES_S = 60.0
 def virtual_sensor(forward_map: ForwardMap) -> VirtualSensor:
     """Return the virtual sensor of the demos, which plays random presses over the whole area of a forward map."""
     rate_Hz = 200.0
-    _min_force_N, max_force_N = DEFAULT_PLAYED_FORCE_RANGE
+    _min_force_N, max_force_N = DEFAULT_PLAYED_FORCE_RANGE  # the smallest force is that of the forward map
     script = random_script(forward_map, rate_Hz, max_force_N)
+    # The amplifier adds its drift and its noise to the charges, so the virtual sensor uses it as its noise.
     measure = measure_function(load_amplifier("reference"), len(forward_map.electrodes), rate_Hz)
     return VirtualSensor(film_charges(forward_map), script, noise=measure)
 
@@ -50,12 +51,22 @@ def film_charges(forward_map: ForwardMap) -> Charges:
     min_force_N = forward_map.domain.force_range[0]
 
     def charges(contact: Array) -> Array:
-        """Compute the charges within the forces of the map, and scale the charges down for smaller forces."""
+        """Compute the charges of contacts with the forward map. Forces below the smallest force of the map are allowed.
+
+        For such a force F, the charges at the smallest force F_min are multiplied by (F / F_min)^(2/3), because the
+        charge of a membrane without pretension is proportional to F^(2/3).
+
+        Args:
+            contact: Positions and forces (x, y, F), shape (n, 3), mm and N.
+
+        Returns:
+            Charges, shape (n, electrodes), pC.
+        """
         x_mm, y_mm, force_N = contact.T
         map_force_N = force_N.clip(min=min_force_N)
         map_charge_pC = forward_map.charges(np.column_stack([x_mm, y_mm, map_force_N]))
-        relative_force = (force_N / map_force_N)[:, None]  # 1 for forces in the domain, otherwise below 1
-        return np.asarray(map_charge_pC * relative_force ** (2.0 / 3.0))
+        force_ratio = (force_N / map_force_N)[:, None]  # F / F_min below the smallest force, otherwise 1
+        return np.asarray(map_charge_pC * force_ratio ** (2.0 / 3.0))
 
     return charges
 
