@@ -37,7 +37,7 @@ def problems(messages):
         found.append(f"/isocharge/wrench: expected a largest force in {FORCE_RANGE_N} N, got {largest_force_N:.3g} N")
     for message in messages["/isocharge/pose"]:
         wrench = wrenches.get(stamp(message))
-        if wrench is None:  # best effort: a message may be lost
+        if wrench is None:  # ROS 2 has lost the wrench, which the quality of service "best effort" allows
             continue
         x_m, y_m = message.pose.pose.position.x, message.pose.pose.position.y
         moment_Nm = (y_m * wrench.force.z, -x_m * wrench.force.z)

@@ -84,7 +84,7 @@ def take_turns(contenders: Sequence[Contender], seconds: float, clock: Clock = t
     for round_number in track(range(ROUNDS), "measuring", ROUNDS):
         for contender, durations_ns in zip(contenders, durations, strict=True):
             if round_number == 1:
-                durations_ns.clear()  # the first round was the warm-up
+                durations_ns.clear()  # the first round, which has the number 0, was the warm-up
             call_end_ns = clock()
             turn_end_ns = call_end_ns + turn_ns
             while call_end_ns < turn_end_ns:
@@ -122,6 +122,8 @@ def press_charges(predictor: Predictor, golden_pC: Singles) -> Singles:
 
 def in_process_contenders(predictor: Predictor, charge_pC: Singles) -> list[Contender]:
     """Return the contenders that call methods of a predictor in this process.
+
+    A contender is one way to compute predictions, whose speed is compared with that of the others.
 
     Two contenders predict one press in each call. In addition, there is one contender for each batch size.
 

@@ -85,6 +85,8 @@ class ErrorSummary:
     def from_errors(cls, error: Array, noise_std: Array, rig_std: Array) -> "ErrorSummary | None":
         """Summarise errors, and compare the mean square error with the variances that noise and rig cause.
 
+        The noise is that of the charges. The rig is the machine that sets the position and the force of each press.
+
         Args:
             error: Components of the error of each press, shape (n, components); NaN where unknown.
             noise_std: Standard deviations of the components, as caused by the noise of the charges.
@@ -97,6 +99,7 @@ class ErrorSummary:
         if not is_known.any():
             return None
         magnitude = np.linalg.norm(error[is_known], axis=1)
+        # Each of the following values is a root mean square over the presses, in the unit of the errors.
         rms = _rms_of_vectors(error[is_known])
         noise = _rms_of_vectors(noise_std[is_known])
         rig = _rms_of_vectors(rig_std[is_known])
@@ -155,8 +158,10 @@ class PressCheck:
         The names of the values contain the units. Unknown values are None.
         """
         agreement = self.agreement
-        degrees = agreement.degrees
-        common = agreement.common
+        degrees_of_freedom = agreement.degrees
+        # Mean errors that are common to all presses, in the order x (mm), y (mm), force (relative). `FORCE` is the
+        # index of the force.
+        common_error = agreement.common
         values: dict[str, Any] = {
             "each": self.errors.rows(),
             "model": self.model,
@@ -165,13 +170,13 @@ class PressCheck:
             "position_mm": self.position_mm,
             "force_percent": self.force_percent,
             "chi_squared": agreement.chi_squared,
-            "degrees_of_freedom": degrees,
-            "chi_squared_per_degree": agreement.chi_squared / degrees if degrees else None,
+            "degrees_of_freedom": degrees_of_freedom,
+            "chi_squared_per_degree": agreement.chi_squared / degrees_of_freedom if degrees_of_freedom else None,
             "p_value": agreement.p_value,
-            "shift_mm": common.mean[:FORCE],
-            "shift_std_mm": common.std[:FORCE],
-            "force_scale": 1.0 + common.mean[FORCE],
-            "force_scale_std": common.std[FORCE],
+            "shift_mm": common_error.mean[:FORCE],  # x and y
+            "shift_std_mm": common_error.std[:FORCE],
+            "force_scale": 1.0 + common_error.mean[FORCE],  # predicted force relative to the measured force
+            "force_scale_std": common_error.std[FORCE],
             "common_p_value": agreement.common_p_value,
             "std_factor": None if self.std_factor is None else self.std_factor.factor,
             "fits": self.fits,
@@ -207,12 +212,13 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     # Summarise the errors of the positions and the errors of the forces, together with the standard deviations that
     # noise and rig cause. Each array has the columns x, y (mm) and force (relative), shape (n_selected, 3). `FORCE` is
     # the index of the column of the force.
+    # `errors.error` is the predicted minus the measured value.
     selected = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
     position_mm = ErrorSummary.from_errors(*[columns[:, :FORCE] for columns in selected])
     force_percent = ErrorSummary.from_errors(*[100.0 * columns[:, FORCE:] for columns in selected])
     misfit_text = _misfit_statement(errors, is_selected, metadata)  # empty unless too many presses have a large misfit
 
-    fits = None  # remains None if there are too few presses for a verdict
+    fits = None  # True or False for a verdict; remains None if there are too few presses
     if selected_count >= MIN_PRESSES:
         fits = agreement.acceptable and not misfit_text
 
@@ -265,10 +271,12 @@ def _bad_presses(errors: PressErrors) -> Booleans:
     # `TEST_SIGNIFICANCE`.
     is_compared = errors.is_compared
     compared_count = is_compared.sum()
-    degrees = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
-    deviate = chi_squared_deviate(errors.chi_squared, degrees)  # has a standard normal distribution for good presses
+    # Number of known errors of each press, which is the number of degrees of freedom of its chi-squared; 1 if none
+    degrees_of_freedom = np.maximum(np.count_nonzero(~np.isnan(errors.error), axis=1), 1)
+    # Chi-squared is converted to a variable that has a standard normal distribution for good presses.
+    z_score = chi_squared_deviate(errors.chi_squared, degrees_of_freedom)
     limit = NormalDist().inv_cdf(1.0 - TEST_SIGNIFICANCE / max(1, compared_count))
-    is_improbable = is_compared & (deviate > limit)
+    is_improbable = is_compared & (z_score > limit)
 
     improbable_count = is_improbable.sum()
     few_are_improbable = improbable_count <= max(1.0, MAX_BAD_FRACTION * compared_count)
@@ -298,8 +306,10 @@ def _misfit_statement(errors: PressErrors, is_selected: Booleans, metadata: Mode
     misfit_count = np.count_nonzero(errors.predicted[is_selected, COLUMNS["misfit"]] > limit)
     if misfit_count == 0:
         return ""
+    # Probabilities that at most 0, 1, ... presses have a large misfit, if all presses are good
     probability_of_at_most = binomial_distribution(selected_count, MISFIT_FRACTION)
-    probability_of_so_many = 1.0 - probability_of_at_most[misfit_count - 1]  # or more, if all presses are good
+    # At least `misfit_count` presses have a large misfit unless at most `misfit_count - 1` presses have one.
+    probability_of_so_many = 1.0 - probability_of_at_most[misfit_count - 1]
     if probability_of_so_many >= TEST_SIGNIFICANCE:
         return ""
     return (
@@ -345,35 +355,37 @@ def _exclusion_notes(errors: PressErrors, validity: Validity) -> Iterator[str]:
         validity: The working area and the range of forces of the model.
     """
     min_force_N, max_force_N = validity.force_range_N
-    domain = (
+    outside_domain = (  # replaces the short reason NOT_TRAINED
         f"outside the model's working area ({validity.area_text}) or forces ({min_force_N:.3g} to {max_force_N:.3g} N)"
         "; if these are most, look at the units"
     )
     reasons = errors.exclusion_reasons
     for reason in sorted(set(reasons.tolist()) - {""}):  # a press that is compared has an empty reason
         excluded = errors.presses[reasons == reason]
-        explanation = domain if reason == NOT_TRAINED else reason
+        explanation = outside_domain if reason == NOT_TRAINED else reason
         yield f"{len(excluded)} of {len(reasons)} presses do not count: {explanation} ({excluded.line_words})"
 
 
 def _common_notes(agreement: Agreement) -> Iterator[str]:
     """Yield a note about a common shift of all positions, and a note about a common scale factor of all forces.
 
-    A note is only yielded if its shift or change of scale is significant: without a common error, a value of this size
-    would have a probability of at most `TEST_SIGNIFICANCE`.
+    A note is only yielded if its shift or change of scale is significant. If the presses have no common error, chance
+    causes such a value of x, of y or of the force with a probability of at most `TEST_SIGNIFICANCE` each.
 
     Args:
         agreement: Tests of the errors, which contain the common errors of x, y and the force.
     """
-    mean, std, significance = agreement.common
+    # Common errors of x (mm), y (mm) and the force (relative), their standard errors, and the common errors divided by
+    # standard errors that include the rig; each of shape (3,). `FORCE` is the index of the force.
+    mean, std, z_score = agreement.common
     limit = NormalDist().inv_cdf(1.0 - 0.5 * TEST_SIGNIFICANCE)  # errors of both signs count
     x_shift_mm, y_shift_mm, force_scale_change = mean
-    if np.nanmax(np.abs(significance[:FORCE]), initial=0.0) > limit:
+    if np.nanmax(np.abs(z_score[:FORCE]), initial=0.0) > limit:
         yield (
             f"positions are off by ({x_shift_mm:.2g}, {y_shift_mm:.2g}) +- {std[:FORCE].max():.2g} mm on the average: "
             "electrodes or rig are shifted"
         )
-    if abs(significance[FORCE]) > limit:
+    if abs(z_score[FORCE]) > limit:
         yield (
             f"forces are {1.0 + force_scale_change:.4g} +- {std[FORCE]:.2g} times the measured ones on the average, as "
             "after a change of pretension, d31 or gains"

@@ -96,6 +96,7 @@ class PressErrors:
         correlations that the model states. The covariance of the rig is diagonal, because the errors of the rig are
         independent. Unknown errors do not count.
         """
+        # The errors are divided by their standard deviations, so that their covariance becomes a correlation matrix.
         # Only the noise is correlated. In the correlation of two errors, the correlation of the noise is therefore
         # multiplied by the share of noise in the standard deviation of each error. The diagonal elements are 1.
         std = np.sqrt(self.variance)
@@ -104,7 +105,8 @@ class PressErrors:
         correlation = np.nan_to_num(noise_correlation)  # an unknown error has no correlations
         correlation[:, range(3), range(3)] = 1.0
 
-        # After division by the standard deviations, the covariance of the errors is `correlation`, shape (n, 3, 3).
+        # The result is d^T C^-1 d with the divided errors d and the matrix C = `correlation`, shape (n, 3, 3). An
+        # unknown error becomes 0, and therefore adds nothing.
         deviation = np.nan_to_num(self.error / std)[:, :, None]  # shape (n, 3, 1)
         return np.asarray((deviation * np.linalg.solve(correlation, deviation)).sum(axis=(1, 2)))
 
@@ -165,13 +167,15 @@ def press_errors(predictor: Predictor, presses: MeasuredPresses) -> PressErrors:
     reported_std = predicted[:, COLUMNS["contact_std"]]
     film_std = np.sqrt(np.maximum(reported_std**2 - (effects**2).sum(axis=0), 0.0))
 
-    # Differences of x and y are errors in mm. Differences of the force are divided by the measured force.
+    # Differences of x and y are errors in mm, and are divided by 1. Differences of the force are divided by the
+    # measured force.
     divisor = np.ones_like(measured)
     divisor[:, FORCE] = measured[:, FORCE]
 
     # Standard deviations of the measured values. The standard deviation of the force is already relative.
     position_std_mm = model_presses.position_std_mm
     rig_std = np.column_stack([position_std_mm, position_std_mm, model_presses.force_std])
+    # Where a measured value is unknown (NaN), the error and both standard deviations are NaN.
     is_unknown = np.isnan(measured)
     return PressErrors(
         presses=model_presses,
@@ -288,7 +292,8 @@ def common_error(error: Array, variance: Array, shared_std: Array) -> CommonErro
 
     # Standard errors of the means, which are increased if the errors scatter more than expected
     chi_squared = np.nansum(weight * (error - mean) ** 2, axis=0)
-    chi_squared_per_degree = chi_squared / np.maximum(is_known.sum(axis=0) - 1, 1)  # the mean uses one degree
+    # The estimated mean uses one degree of freedom.
+    chi_squared_per_degree = chi_squared / np.maximum(is_known.sum(axis=0) - 1, 1)
     std = np.sqrt(np.maximum(chi_squared_per_degree, 1.0) / total_weight)
 
     # Significance of the means in view of the part of the errors that is equal in all presses
@@ -319,9 +324,11 @@ class Agreement:
     def from_errors(cls, errors: PressErrors, is_selected: Booleans) -> "Agreement":
         """Test whether noise and rig explain the errors of the selected presses.
 
-        The statistic of the first test is the sum of `PressErrors.chi_squared`. The statistic of the second test is the
-        sum of the squared significances of the common errors. If noise, film and rig explain the errors, each statistic
-        has nearly a chi-squared distribution.
+        The first test examines the scatter of the errors. Its statistic is the sum of `PressErrors.chi_squared`. The
+        second test examines the common errors, which are the mean errors of x, y and the force over all presses. Its
+        statistic is the sum of the squared significances of the common errors. If noise, film and rig explain the
+        errors, each statistic has nearly a chi-squared distribution. The number of degrees of freedom is the number of
+        known errors in the first test, and the number of known common errors in the second test.
 
         Args:
             errors: Errors of all presses; NaN where a measured value is unknown.

@@ -44,6 +44,7 @@ def read_charges(path: Path, electrodes: tuple[str, ...]) -> Array:
     expected_header = f"a header with one column for each of the electrodes {electrodes} and charges in pC"
     charge_rule = replace(CHARGE_RULE, may_be_empty=False)  # a model needs the charges of all electrodes
     with open_table(path, electrodes, ChargeError, expected_header) as table:
+        # All columns are required, and no columns are optional.
         columns = table.read(dict.fromkeys(electrodes, charge_rule), {}, MAX_CHARGE_ROWS)
     return np.column_stack([columns.values[name] for name in electrodes])
 
@@ -63,7 +64,7 @@ def write_contacts(charge_pC: Array, predictor: Predictor, out: TextIO) -> None:
     Raises:
         ChargeError: If the charges do not fit the model.
     """
-    names = (*Contact._fields[: CORRELATION_COLUMNS.start], "flags")
+    names = (*Contact._fields[: CORRELATION_COLUMNS.start], "flags")  # the correlations are the last fields
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(names)
     for record in table_records(charge_pC, predictor):
@@ -90,6 +91,7 @@ def table_records(charge_pC: Array, predictor: Predictor) -> Iterator[Prediction
     for start in range(0, len(charge_pC), MAX_BATCH):
         block = np.asarray(charge_pC[start : start + MAX_BATCH])
         contacts = predictor.predict_batch(block)
+        # Each row has the flags of its contact, and the information whether its charges exceed the noise.
         flags_of_rows = predictor.validity.batch_flags(contacts)
         is_touch_of_rows = predictor.validity.is_touch(block).tolist()
         rows = zip(block.tolist(), np.asarray(contacts).tolist(), flags_of_rows, is_touch_of_rows, strict=True)

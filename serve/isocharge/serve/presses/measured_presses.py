@@ -39,6 +39,7 @@ MAX_ROWS = 1_000_000
 """Largest number of presses in a file."""
 
 CONTACT = ("x_mm", "y_mm", "force_N")
+"""Names of the columns of the position and the force."""
 
 TEMPERATURE = "temperature_C"
 """Name of a column that is not used and that does not count as an electrode."""
@@ -89,7 +90,8 @@ class MeasuredPresses:
     def __post_init__(self) -> None:
         """Check the names of the electrodes, the shapes of the arrays and all values."""
         _check_electrodes(self.electrodes)
-        count = len(self.lines)
+        count = len(self.lines)  # each press has a line number
+        # Shapes of contact, charge_pC, position_std_mm and force_std. A contact has the three values `CONTACT`.
         expected = ((count, len(CONTACT)), (count, len(self.electrodes)), (count,), (count,))
         shapes = tuple(array.shape for array in (self.contact, self.charge_pC, self.position_std_mm, self.force_std))
         if shapes != expected:
@@ -182,10 +184,11 @@ class MeasuredPresses:
         rules = PRESS_RULES | dict.fromkeys(self.electrodes, CHARGE_RULE)
         for name in ("position_std_mm", "force_std"):
             rules[name] = replace(rules[name], may_be_empty=False)
-        columns = NumberColumns(self.columns, self.lines)
-        columns.check(rules, where="", error_class=PressError)  # the caller knows the file, if there is one
+        columns = NumberColumns(self.columns, self.lines)  # `self.columns` are arrays by the names of the columns
+        # The message does not begin with the name of a file, because only the caller knows the file, if there is one.
+        columns.check(rules, where="", error_class=PressError)
 
-        _refuse_half_positions(columns)
+        _refuse_single_coordinates(columns)
         has_no_charge = np.isnan(self.charge_pC).all(axis=1)
         if has_no_charge.any():
             raise PressError(
@@ -194,7 +197,7 @@ class MeasuredPresses:
             )
 
 
-def _refuse_half_positions(columns: NumberColumns) -> None:
+def _refuse_single_coordinates(columns: NumberColumns) -> None:
     """Raise an error for the first press for which only one of the two coordinates x and y is known.
 
     Args:
@@ -203,6 +206,7 @@ def _refuse_half_positions(columns: NumberColumns) -> None:
     Raises:
         PressError: If there is such a press.
     """
+    # Whether exactly one coordinate of each press is known
     is_half = np.isnan(columns.values["x_mm"]) != np.isnan(columns.values["y_mm"])
     if is_half.any():
         raise PressError(
@@ -238,7 +242,9 @@ def read_presses(
         if not is_allowed:
             raise PressError(f"{name}: expected {PRESS_RULES[name].description}, got {std:g}")
 
-    # Read the columns of the file that are electrodes or have another meaning for a press (`PRESS_RULES`).
+    # Read the columns of the file that are electrodes (required) or have another meaning for a press (optional). The
+    # keys of `PRESS_RULES` are the names of the columns with another meaning. `open_table` recognises the header by the
+    # known names.
     expected_electrodes = "the electrodes' names" if electrodes is None else f"the electrodes {tuple(electrodes)}"
     expected_header = f"a header with {', '.join(CONTACT)} and {expected_electrodes} (charges in pC)"
     with open_table(path, (*(electrodes or ()), *PRESS_RULES), PressError, expected_header) as table:
@@ -247,7 +253,8 @@ def read_presses(
             _check_electrodes(electrode_names)
         columns = _read_rows(table, dict.fromkeys(electrode_names, CHARGE_RULE), PRESS_RULES)
 
-    # Columns that the file does not have are filled with NaN. Missing standard deviations get their default values.
+    # `columns.values` is a dictionary of arrays by the names of the columns. Columns that the file does not have are
+    # filled with NaN. Missing standard deviations get their default values.
     unknown_values = np.full(len(columns.lines), np.nan)
     values = {name: columns.values.get(name, unknown_values) for name in (*electrode_names, *PRESS_RULES)}
     for name, std in default_stds.items():
@@ -305,11 +312,12 @@ def read_press_list(path: Path) -> Array:
     Raises:
         PressError: If the file cannot be read, or a row is not a press. The message names the line and the column.
     """
+    # `CONTACT` are the names of the columns. All three are required, and no others are read.
     with open_table(path, CONTACT, PressError, f"a header with {', '.join(CONTACT)}") as table:
         columns = _read_rows(table, {name: PRESS_RULES[name] for name in CONTACT}, {})
     with error_context(PressError, f"{path}, "):
-        _refuse_half_positions(columns)
-    return np.column_stack([columns.values[name] for name in CONTACT])
+        _refuse_single_coordinates(columns)
+    return np.column_stack([columns.values[name] for name in CONTACT])  # `columns.values` are arrays by name
 
 
 def write_presses(path: Path, presses: MeasuredPresses) -> None:

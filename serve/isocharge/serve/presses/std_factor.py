@@ -52,8 +52,8 @@ class StdFactor(NamedTuple):
 
         The score of a press is the factor with which its 95 % region just contains the measured values. The region is
         an ellipsoid with axes along x, y and the force, without the correlations that the model states. The result is
-        the smallest score that meets a condition: with the probability `CONFIDENCE`, the score is large enough for at
-        least the share `COVERAGE` of all future presses.
+        the smallest of the given scores that meets a condition: with the probability `CONFIDENCE`, it is not exceeded
+        by the scores of at least the share `COVERAGE` of all future presses.
 
         Args:
             error: Errors of x, y and the force, shape (n, 3); NaN if unknown. A press without a known error is left
@@ -66,18 +66,22 @@ class StdFactor(NamedTuple):
         known_count = np.isfinite(error).sum(axis=1)  # number of known errors of each press
         is_known = known_count > 0
         chi_squared = np.nansum((error / std) ** 2, axis=1)[is_known]
-        region_chi_squared = np.take(REGION_QUANTILES, known_count[is_known] - 1)  # on the surface of the region
+        # Chi-squared on the surface of the region: the 95 % quantile for 1, 2 or 3 known errors
+        region_chi_squared = np.take(REGION_QUANTILES, known_count[is_known] - 1)
         scores = np.sort(np.sqrt(chi_squared / region_chi_squared))
 
-        # Each score lies below the quantile `COVERAGE` of all future scores with the probability `COVERAGE`, so that
-        # the number of scores below this quantile has a binomial distribution. If this number is at most k, the score
-        # at index k is not below the quantile. Choose the smallest k for which this has the probability `CONFIDENCE`.
+        # The wanted factor is at least the quantile `COVERAGE` of the scores of future presses. Each of the n sorted
+        # scores lies below this unknown quantile with the probability `COVERAGE`. `binomial_distribution` returns, for
+        # each k, the probability that at most k scores lie below it. In this case, `scores[k]` is not below the
+        # quantile. `argmax` returns the smallest k whose probability is at least `CONFIDENCE`.
         index = np.argmax(binomial_distribution(len(scores), COVERAGE) >= CONFIDENCE)
         return cls(float(scores[index]), len(scores))
 
 
 def binomial_distribution(count: int, probability: float) -> Array:
     """Compute the probabilities that at most 0, 1, ... `count` of `count` trials succeed, shape (count + 1,).
+
+    The result is the cumulative binomial distribution.
 
     The logarithms of the probabilities are added up, because the binomial coefficients would overflow.
 

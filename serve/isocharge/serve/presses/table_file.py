@@ -86,11 +86,13 @@ class CsvTable:
         self._names = names
         self._error_class = error_class
         self._expected = expected
-        self._mark = ""  # point or comma in the numbers of the file; empty until a number has one
-        self._is_mark_decimal = False  # whether a number has shown that the mark does not separate thousands
+        # The numbers of a file have one mark, a point or a comma. The mark is empty until a number with a mark is read.
+        # It counts as a decimal mark as soon as a number such as 0.5 shows that it does not separate thousands.
+        self._number_mark = ""
+        self._is_mark_decimal = False
 
         # Search for the header among the first lines. If the header is a comment, `header_line` does not contain the
-        # mark #.
+        # comment sign #.
         line_iterator = self._checked_lines(lines)
         first_lines = list(islice(line_iterator, _MAX_LINES_TO_HEADER))
         lines_above, self._separator, header_line = _find_header(first_lines or [""], names)
@@ -103,6 +105,7 @@ class CsvTable:
             raise self.error(f": empty; expected {expected}")
         if len(header_cells) > MAX_COLUMNS:
             raise self.error(f": expected at most {MAX_COLUMNS:,} columns, got {len(header_cells):,}")
+        # A known name is not changed, because it may begin or end with blanks.
         self.header = tuple(name if name in names else name.strip() for name in header_cells)
 
     def error(self, message: str) -> InputError:
@@ -125,9 +128,9 @@ class CsvTable:
             The required columns, and then the optional columns.
 
         Raises:
-            InputError: If a required column is missing, or if a required or optional column occurs twice. If the name
-                of a column is similar to the name of a missing column, such as `a (pC)` to `A`. If the file is damaged
-                or has more than `max_rows` rows. If a cell violates the rule of its column.
+            InputError: If one of these conditions is met: a required column is missing; a required or optional column
+                occurs twice; the name of a column is similar to the name of a missing column, such as `a (pC)` to `A`;
+                the file is damaged or has more than `max_rows` rows; a cell violates the rule of its column.
         """
         known_rules = {**required, **optional}
         other_names = [name for name in self.header if name not in known_rules]
@@ -162,7 +165,7 @@ class CsvTable:
         missing_name_of_spelling: dict[str, str] = {}
         for name in names:
             if name not in self.header:
-                # Without the second set, the column `ApC` would not be similar to the electrode `A`.
+                # The second set has the spellings with a unit, so that the column `ApC` is similar to the name `A`.
                 spellings = _spellings(name) | _spellings(f"{name}_pC")
                 if name == "force_N":  # F (N), F (mN) and F (g) are forces, but `F` without a unit may be an electrode
                     spellings |= {"fn", "fmn", "fg"}
@@ -184,8 +187,13 @@ class CsvTable:
 
         Whether the numbers lie in the ranges of their columns is not checked here.
 
+        The point or the comma in the numbers of the file is called their mark. The method `_number` stores the mark of
+        the file in `_number_mark`. The mark may be a decimal mark, or a separator of thousands as in `1,064`. A single
+        number such as `0,5` in any row shows that the mark is decimal (`_is_mark_decimal`). If the numbers have a mark,
+        but none of them shows this, the file is refused.
+
         Args:
-            rules: Rules of the requested columns, by the names of the columns.
+            rules: Rules of the requested columns, by the names of the columns. The header contains all of them.
             max_rows: Largest number of rows that is accepted.
 
         Raises:
@@ -198,7 +206,7 @@ class CsvTable:
         numbers = array("d")  # the numbers of the first row, then the numbers of the second row, and so on
         for index, (line_number, cells) in enumerate(self._rows):
             requested_cells = [cells[i] for i in column_indices.values() if i < len(cells)]
-            if index == 0 and _is_row_of_units(requested_cells):
+            if index == 0 and _is_row_of_units(requested_cells):  # a row such as mm, mm, N, pC below the header
                 continue
             if len(line_numbers) == max_rows:  # the arrays already contain as many rows as are allowed
                 raise self.error(f": expected at most {max_rows:,} presses, got more; split the file")
@@ -212,7 +220,7 @@ class CsvTable:
             for name, column_index in column_indices.items():
                 cell = cells[column_index].strip()
                 number = self._number(cell)
-                if number is None:
+                if number is None:  # the cell is neither empty nor a finite number with the mark of the file
                     raise self.error(
                         f", line {line_number}, column {shown(name)}: expected {rules[name].description}, got "
                         f"{shown(cell)}{self._cell_advice(cell)}"
@@ -220,10 +228,10 @@ class CsvTable:
                 numbers.append(number)
             # The columns that are not read may show, too, that the mark of the numbers is a decimal mark.
             self._is_mark_decimal = self._is_mark_decimal or self._has_fraction(cells)
-        if self._mark and not self._is_mark_decimal:
+        if self._number_mark and not self._is_mark_decimal:
             raise self.error(
-                f": every number with the mark {self._mark!r} may have a decimal mark or a separator of thousands; "
-                "write commas between the columns, decimal points and no separators of thousands"
+                f": every number with the mark {self._number_mark!r} may have a decimal mark or a separator of "
+                "thousands; write commas between the columns, decimal points and no separators of thousands"
             )
         rows = np.asarray(numbers).reshape(len(line_numbers), len(column_indices))
         values = dict(zip(column_indices, rows.T, strict=True))
@@ -233,15 +241,15 @@ class CsvTable:
         """Return advice for a cell that is not a number, for the end of an error message; empty if there is none."""
         if "pC" in cell:  # this cell is right, but another one is wrong
             return "; a row of units may only contain mm, N and pC"
-        has_other_mark = ({",", "."} - {self._mark}) & {*cell}
-        return f"; the decimal mark is {self._mark!r}" if self._mark and has_other_mark else ""
+        has_other_mark = ({",", "."} - {self._number_mark}) & {*cell}
+        return f"; the decimal mark is {self._number_mark!r}" if self._number_mark and has_other_mark else ""
 
     def _has_fraction(self, cells: list[str]) -> bool:
         """Return whether a cell of any column has a fraction such as 0.5, whose mark does not separate thousands."""
-        if not self._mark:
+        if not self._number_mark:
             return False
         texts = (cell.strip().lstrip("+-") for cell in cells)
-        return any(text.startswith(f"0{self._mark}") and _NUMBER.fullmatch(text) for text in texts)
+        return any(text.startswith(f"0{self._number_mark}") and _NUMBER.fullmatch(text) for text in texts)
 
     def _number(self, text: str) -> float | None:
         """Return the number in a cell: NaN for an empty cell, and None for a cell without a finite number.
@@ -250,8 +258,9 @@ class CsvTable:
         may be a decimal mark, or a separator of thousands as in `1,064`. Some numbers show that the mark is a decimal
         mark: `0,5`, `12,34` and `1,064e3` cannot be whole numbers with a separator of thousands.
 
-        The function stores the first mark of the file in `_mark`. As soon as a number shows that this mark is a decimal
-        mark, `_is_mark_decimal` becomes true.
+        The function stores the first mark of the file in `_number_mark`. As soon as a number shows that this mark is a
+        decimal mark, `_is_mark_decimal` becomes true. The number `1,064` is always read as 1.064. If no number of the
+        file has shown that its mark is a decimal mark, `_read_columns` refuses the file.
 
         Args:
             text: The cell, without blanks at its ends.
@@ -263,13 +272,15 @@ class CsvTable:
             return None
         mark = match[1] or match[2]  # the first group matches the mark in `3.5`, the second group the mark in `.5`
         if mark:
-            self._mark = self._mark or mark
-            if mark != self._mark:
+            self._number_mark = self._number_mark or mark
+            if mark != self._number_mark:
                 return None
             if not self._is_mark_decimal:
                 # Where points separate thousands, commas are decimal marks and do not separate the columns of a file.
-                is_decimal_point = self._separator == "," and mark == "."
-                self._is_mark_decimal = is_decimal_point or _THOUSANDS.fullmatch(text) is None
+                # If commas separate the columns, a point is therefore a decimal mark.
+                must_be_decimal = self._separator == "," and mark == "."
+                # `_THOUSANDS` matches a number whose mark may separate thousands, such as `1,064`.
+                self._is_mark_decimal = must_be_decimal or _THOUSANDS.fullmatch(text) is None
         number = float(text.replace(",", "."))
         return number if math.isfinite(number) else None
 
@@ -304,14 +315,15 @@ class CsvTable:
                     )
                 wrong_character = _WRONG_BYTE.search(line)
                 if wrong_character:  # the file is binary, or text in another encoding
-                    wrong_byte = ord(wrong_character[0]) & 0xFF  # the surrogate U+DCxx stands for the byte 0xxx
+                    # The surrogate U+DC80 stands for the byte 0x80, and so on. Its lowest eight bits are the byte.
+                    wrong_byte = ord(wrong_character[0]) & 0xFF
                     raise self.error(
                         f", line {line_number}: the byte 0x{wrong_byte:02x} is not text in UTF-8: export the file as "
                         "CSV in UTF-8; convert other text with: iconv -f UTF-16 (or WINDOWS-1252) -t UTF-8 FILE > "
                         "NEW.csv"
                     )
                 yield line.removeprefix("\ufeff") if line_number == 1 else line
-        except InputError:  # is a ValueError, too
+        except InputError:  # an error that is raised above, and that is a ValueError, too
             raise
         except ValueError as cause:  # the next line is too long
             raise self.error(f", line {line_number + 1}: not CSV text in UTF-8 ({cause})") from cause
@@ -324,7 +336,7 @@ class CsvTable:
 
         Args:
             lines: Lines of the text, each with its line end.
-            lines_above: Number of lines above these lines.
+            lines_above: Number of lines of the file above these lines.
 
         Raises:
             InputError: If the lines are not CSV text.
@@ -332,7 +344,7 @@ class CsvTable:
         reader = csv.reader(lines, delimiter=self._separator, strict=True)
         try:
             for cells in reader:
-                first_cell = "".join(cells[:1]).strip()
+                first_cell = "".join(cells[:1]).strip()  # empty for a row without cells
                 is_comment = first_cell.startswith("#") and first_cell not in self._names
                 if "".join(cells).strip() and not is_comment:
                     yield lines_above + reader.line_num, cells
@@ -369,17 +381,19 @@ def _find_header(lines: Sequence[str], names: Collection[str]) -> tuple[int, str
 
     Args:
         lines: First lines of the text, at least one.
-        names: Names of columns that have a meaning.
+        names: Known names of columns.
 
     Returns:
-        The number of lines above the header, the separator, and the header without the mark of a comment.
+        The number of lines above the header, the separator, and the header without the comment sign #.
     """
+    # Search first without the comments, and then with the texts of the comments. In both lists, the index of a line is
+    # the number of lines above it.
     lines_without_comments = ["" if line.startswith("# ") else line for line in lines]
-    uncommented_lines = [line.removeprefix("# ") for line in lines]
-    for lines_above, line in chain(enumerate(lines_without_comments), enumerate(uncommented_lines)):
+    lines_without_sign = [line.removeprefix("# ") for line in lines]
+    for lines_above, line in chain(enumerate(lines_without_comments), enumerate(lines_without_sign)):
         separator = _best_separator(line, names)
-        name_count, _ = _header_score(line, names, separator)
-        if name_count > 0:
+        name_count, _cell_count = _header_score(line, names, separator)
+        if name_count > 0:  # the line contains a known name and no number, because with a number the count is 0
             return lines_above, separator, line
     return 0, _best_separator(lines[0], names), lines[0]
 
@@ -392,9 +406,11 @@ def _best_separator(line: str, names: Collection[str]) -> str:
 def _header_score(line: str, names: Collection[str], separator: str) -> tuple[int, int]:
     """Return the number of known names and the number of cells in a line. A line with a number has no names.
 
+    Equal cells are counted once.
+
     Args:
         line: The line.
-        names: Names of columns that have a meaning.
+        names: Known names of columns.
         separator: Separator of the cells.
     """
     try:
@@ -436,7 +452,8 @@ def open_table(path: Path, names: Collection[str], error_class: type[InputError]
     where = "stdin" if is_stdin else str(path)
     file_or_descriptor = STDIN_FILENO if is_stdin else path
     try:
-        # The CSV reader handles the line ends. The table refuses bytes that are not UTF-8.
+        # The CSV reader handles the line ends. A byte that is not UTF-8 becomes a surrogate character, which the table
+        # refuses. Standard input remains open after the block.
         with open(
             file_or_descriptor, encoding="utf-8", errors="surrogateescape", newline="", closefd=not is_stdin
         ) as text:

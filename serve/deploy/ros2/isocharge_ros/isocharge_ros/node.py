@@ -49,7 +49,11 @@ class TouchNode(Node):
         self.latest_diagnostic_s = 0.0  # time of the record with which the latest diagnostic was published, s
 
     def publish(self, record):
-        """Publish the flags and the wrench of a prediction record and, if something touches the film, the pose."""
+        """Publish the flags and the wrench of a prediction record and, if something touches the film, the pose.
+
+        A diagnostic is also published, but at most once in `DIAGNOSTIC_INTERVAL_s`. It counts the records and the flags
+        since the previous diagnostic.
+        """
         flags = String()
         flags.data = ",".join(record.flags)
         self.flags_publisher.publish(flags)
@@ -63,7 +67,8 @@ class TouchNode(Node):
             self.n_records = 0
         if record.force_N is None:  # the force is unknown, for example because the board has sent a value that is NaN
             return
-        record_values = with_tracked_contact(record.json_values)  # a tracked contact replaces the contact of the frame
+        # A tracked contact replaces the contact of the frame. The record itself still gives the header of the messages.
+        record_values = with_tracked_contact(record.json_values)
         self.publish_wrench(record_values, record)
         if record.contact:
             self.publish_pose(record_values, record)
@@ -114,7 +119,8 @@ class TouchNode(Node):
     def publish_diagnostic(self, record):
         """Publish the meanings of the flags since the last diagnostic, and how many records had each flag.
 
-        The level is OK without flags, ERROR if a record had the flag `invalid`, and WARN with other flags.
+        The level is OK without flags, ERROR if a record had the flag `invalid`, and WARN with other flags. The caller
+        sets the counts back to zero afterwards.
 
         Args:
             record: The latest record.
@@ -140,7 +146,7 @@ class TouchNode(Node):
 
     def with_header(self, message, record):
         """Copy the coordinate frame and the time of a record into the header of a message, and return the message."""
-        time_ns = ros_time_ns({"timestamp": record.timestamp})
+        time_ns = ros_time_ns({"timestamp": record.timestamp})  # the function expects a record as a dictionary
         seconds, nanoseconds = divmod(time_ns, NANOSECONDS_PER_SECOND)
         message.header.frame_id = record.frame_id
         message.header.stamp.sec = seconds
