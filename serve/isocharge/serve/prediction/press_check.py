@@ -99,7 +99,7 @@ class ErrorSummary:
         if not is_known.any():
             return None
         magnitude = np.linalg.norm(error[is_known], axis=1)
-        # Each of the following values is a root mean square over the presses, in the unit of the errors.
+        # The next four values are root mean squares over the presses, in the unit of the errors.
         rms = _rms_of_vectors(error[is_known])
         noise = _rms_of_vectors(noise_std[is_known])
         rig = _rms_of_vectors(rig_std[is_known])
