@@ -75,18 +75,21 @@ class Channels:
 
         Args:
             setup: Settings of all stages.
-            any_unit: Whether the names of the channels may contain any unit, even if the gain is not known.
+            any_unit: Whether channels may have names with any unit, such as `A_mV`, although the device file states no
+                gain that converts the unit to pC.
 
         Raises:
             DeviceError: If a key of `[channels]` is not the name of an electrode.
         """
         gain = setup.device.rule(GainRule)
         self._allows_any_unit = any_unit or gain is not None
-        self._has_gains = gain is not None and isinstance(gain.pC_per_unit, dict)  # one for each electrode
+        # Channels with different units need a gain of each electrode. A single number is the same gain for all.
+        self._has_gain_per_electrode = gain is not None and isinstance(gain.pC_per_unit, dict)
         self._electrodes = setup.electrodes
-        self._channels = setup.device.channels
+        self._channels = setup.device.channels  # name or number of the channel of each electrode; may be empty
         for key in self._channels:
-            if key not in setup.electrodes:  # TOML adds a key at the end of the file to the last section
+            if key not in setup.electrodes:
+                # The message mentions other sections, because TOML adds a key at the end of a file to the last section.
                 raise DeviceError(
                     f"{setup.device.where}: channels.{cut(key)}: expected one of the electrodes {setup.electrodes}; "
                     "correct or remove the key; a key outside of all sections belongs above the first section"
@@ -108,20 +111,25 @@ class Channels:
             indices = tuple(self._assigned_index(electrode, frame) for electrode in self._electrodes)
         else:
             indices = self.indices_by_name_or_order(frame) or ()
-        if not indices:
+        if not indices:  # no channel has the name of an electrode, and there are more or fewer channels
             raise self._assignment_error(frame)
         if len(set(indices)) < len(indices):
             raise self._assignment_error(frame, "; [channels] gives two electrodes the same channel")
+        # A name without a unit counts as a name with the unit pC.
         units = {stated_unit(channel_names(frame)[index]) or "pC" for index in indices}
-        if len(units) > 1 and not self._has_gains:
+        if len(units) > 1 and not self._has_gain_per_electrode:
             raise self._assignment_error(frame, "; their units differ: state pC_per_unit of each electrode in [gain]")
         return indices
 
     def indices_by_name_or_order(self, frame: Frame) -> tuple[int, ...] | None:
         """Find the channel of each electrode by the names or the order of the channels, without the device file.
 
-        A channel with the name of an electrode belongs to this electrode. If no channel has the name of an electrode,
-        the first channel belongs to the first electrode, the second channel to the second electrode, and so on.
+        The first rule in this list that applies is used:
+
+        1. A channel with the name of an electrode belongs to this electrode.
+        2. If a line of text names all electrodes, as in `C,A,B: 3,1,2`, the first name belongs to the first channel,
+           the second name to the second channel, and so on.
+        3. The first channel belongs to the first electrode, the second channel to the second electrode, and so on.
 
         Args:
             frame: A frame, whose channels may have names.
@@ -135,40 +143,40 @@ class Channels:
                 than pC and the gain is not known, if it is not clear to which values the names in a line of text
                 belong, or if the numbers in the names of the channels do not increase.
         """
-        indices = self._matches(frame.names)  # for each electrode, the channels that have its name
-        is_each_named_once = all(len(indices_of_electrode) == 1 for indices_of_electrode in indices)
+        named_channels = self._matching_indices(frame.names)  # for each electrode, the channels that have its name
+        is_each_named_once = all(len(channels_of_electrode) == 1 for channels_of_electrode in named_channels)
         # If the channels of the electrodes are known, the units of the other channels do not matter.
-        names = [frame.names[index] for (index,) in indices] if is_each_named_once else frame.names
-        advice = "" if self._allows_any_unit else _unit_advice(names)
-        if is_each_named_once and not advice:
-            return tuple(index for (index,) in indices)
+        names = [frame.names[index] for (index,) in named_channels] if is_each_named_once else frame.names
+        unit_advice = "" if self._allows_any_unit else _unit_advice(names)  # empty if no unit is wrong
+        if is_each_named_once and not unit_advice:
+            return tuple(index for (index,) in named_channels)
 
         # A line of text may contain all names before or after the values, as in `C,A,B: 3,1,2`.
         words = tuple(word for text in frame.words for word in _words_of(text))
-        places = self._matches(words)  # for each electrode, the positions of its name among the words
-        is_each_in_line_once = all(len(places_of_electrode) == 1 for places_of_electrode in places)
+        word_places = self._matching_indices(words)  # for each electrode, the positions of its name among the words
+        is_each_in_line_once = all(len(word_places_of_electrode) == 1 for word_places_of_electrode in word_places)
         counts_differ = len(frame.values) != len(self._electrodes)
 
         # The order decides only if nothing contradicts it. It is contradicted by a channel with the name of an
         # electrode, by a wrong unit, and by a line that names all electrodes but has more or fewer values.
-        if any(indices) or advice or (is_each_in_line_once and counts_differ):
-            raise self._assignment_error(frame, advice)
+        if any(named_channels) or unit_advice or (is_each_in_line_once and counts_differ):
+            raise self._assignment_error(frame, unit_advice)
         if counts_differ:
             return None
         if is_each_in_line_once:  # the first name in the line belongs to the first value, and so on
-            places_in_order = sorted(places)
-            return tuple(places_in_order.index(place) for place in places)
+            places_in_order = sorted(word_places)
+            return tuple(places_in_order.index(place) for place in word_places)
         if not _are_in_order(frame.names):
             raise self._assignment_error(frame)
         return tuple(range(len(self._electrodes)))
 
-    def _matches(self, names: tuple[str, ...]) -> list[list[int]]:
+    def _matching_indices(self, names: tuple[str, ...]) -> list[list[int]]:
         """Return, for each electrode, the indices of the names that belong to it.
 
-        A name belongs to an electrode if one of its words is the name of the electrode, as in `A_pC`. The name of the
-        electrode may also be the part in which the given names differ, as in `chA` and `chB`. Capital and small letters
-        are not distinguished. If each electrode has a name that equals the electrode's name, only these names count.
-        For example, `temp_C` is then no name of the electrode C.
+        A name belongs to an electrode if all words of the electrode's name are among its words, as in `A_pC` for the
+        electrode A. The part in which the given names differ also counts as a word, such as `A` in `chA` and `chB`.
+        Capital and small letters are not distinguished. If each electrode has a name that equals the electrode's name,
+        only these names count. For example, `temp_C` is then no name of the electrode C.
 
         Args:
             names: Names of channels, or words of a line of text.
@@ -177,7 +185,10 @@ class Channels:
             return [[names.index(electrode)] for electrode in self._electrodes]
         folded_names = [name.casefold() for name in names]
         distinctive_parts = _distinctive_parts(folded_names)
-        words_of_names = [{*_words_of(name), part} for name, part in zip(folded_names, distinctive_parts, strict=True)]
+        words_of_names = [
+            {*_words_of(name), distinctive_part}
+            for name, distinctive_part in zip(folded_names, distinctive_parts, strict=True)
+        ]
         matches = []
         for electrode in self._electrodes:
             electrode_words = _words_of(electrode.casefold())
@@ -279,10 +290,13 @@ def stated_unit(name: str) -> str:
 
 
 def _unit_advice(names: Sequence[str]) -> str:
-    """Return advice for the first channel whose name states a unit other than pC; empty without such a channel."""
+    """Return advice for the first channel whose name states a unit other than pC; empty without such a channel.
+
+    The advice is a part of an error message. `[gain]` is the section of the device file with the charge of each unit.
+    """
     for name in names:
         unit = stated_unit(name)
-        if unit not in ("", "pC"):
+        if unit not in ("", "pC"):  # the name states a unit, and not the right one
             return f"; channel {shown(name)} is in {unit}: convert it to pC, or state the charge of a unit in [gain]"
     return ""
 
@@ -304,20 +318,24 @@ class Gain(Stage):
     rule_class = GainRule
 
     def __init__(self, setup: Setup) -> None:
-        """Set the conversion. Without settings, the values are charges in pC."""
-        self._channels = Channels(setup)
-        # Channel names and number of values of the previous frame, and the function that selects from the values of
-        # such a frame those of the electrodes. The first frame replaces both.
-        self._layout: tuple[tuple[str, ...], int] | None = None
+        """Prepare the conversion of the values of a board to charges. Without settings, the values are charges in pC.
+
+        Raises:
+            DeviceError: If the device file assigns a channel, a gain or an offset to something that is no electrode.
+        """
+        self._channels = Channels(setup)  # which channel belongs to which electrode
+        self._layout: tuple[tuple[str, ...], int] | None = None  # names and number of the values of the previous frame
+        # Function that selects from the values of such a frame those of the electrodes; the first frame replaces it.
         self._select: itemgetter[Any] = itemgetter(0)
         rule = setup.device.rule(GainRule) or GainRule(pC_per_unit=1.0)
         self.gain_pC = setup.for_each_electrode("gain.pC_per_unit", rule.pC_per_unit)
         self.offset = setup.for_each_electrode("gain.offset", rule.offset)
-        # A valid charge is at most `LARGEST` pC. Without electrodes, the smallest positive number replaces the gain.
+        # A valid charge is at most `LARGEST` pC. Without electrodes, there is no gain, and a tiny number avoids an
+        # error. The limit is then so large that it has no effect.
         largest_gain_pC = float(np.abs(self.gain_pC).max(initial=np.finfo(float).tiny))
         self.max_magnitude = LARGEST / largest_gain_pC
-        self._skipped_s = 0.0  # duration of the invalid frames since the last valid frame
-        self._skipped_intervals = 0  # number of sampling intervals in this time
+        self._invalid_s = 0.0  # duration of the invalid frames since the last valid frame
+        self._invalid_intervals = 0  # number of sampling intervals in this time
 
     def step(self, frame: Frame) -> None:
         """Convert the values of a frame to charges, and mark the frame as invalid if a value cannot be a charge.
@@ -334,20 +352,21 @@ class Gain(Stage):
             self._select = itemgetter(*self._channels.channel_indices(frame))
             self._layout = layout
         # With a single index, `itemgetter` returns a number, which `reshape` converts to an array with one element.
+        # `sent` has one value for each electrode, in the unit of the board.
         frame.sent = np.array(self._select(frame.values), dtype=float).reshape(-1)
         with np.errstate(over="ignore"):  # a value may be so large that its conversion overflows
             frame.raw_pC = (frame.sent - self.offset) * self.gain_pC
         magnitude = math.hypot(*frame.sent.tolist())  # at least the largest absolute value; NaN if a value is NaN
         if not magnitude <= self.max_magnitude:  # the condition is negated, so that it is true for NaN
-            self._skipped_s += frame.dt_s
-            self._skipped_intervals += frame.intervals
+            self._invalid_s += frame.dt_s
+            self._invalid_intervals += frame.intervals
             frame.is_valid = False
             frame.flags.append(INVALID)
             return
-        frame.dt_s += self._skipped_s
-        frame.intervals += self._skipped_intervals
-        self._skipped_s = 0.0
-        self._skipped_intervals = 0
+        frame.dt_s += self._invalid_s
+        frame.intervals += self._invalid_intervals
+        self._invalid_s = 0.0
+        self._invalid_intervals = 0
         frame.charge_pC = frame.raw_pC
 
     @classmethod

@@ -62,15 +62,16 @@ class Hum(Stage):
     def __init__(self, setup: Setup) -> None:
         """Begin with an estimate of zero hum."""
         self._rule = setup.device.rule(HumRule) or HumRule()
-        self._phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)  # amplitude and phase by channel
-        # The reference is the frame with which the next frame is compared: its unit phasor, its charges, and its age.
-        self._reference_phasor = 0j
-        self._elapsed_s = 0.0
+        # The hum of each channel: the magnitude is its amplitude, and the angle is its phase.
+        self._hum_phasor_pC: Complexes = np.zeros(len(setup.electrodes), dtype=complex)
+        # The reference is the earlier frame with which the next frame is compared. `reset` begins without its charges.
+        self._reference_phasor = 0j  # unit phasor exp(2 pi i f t) of the mains; 0 before the first reference
+        self._reference_age_s = 0.0
         self.reset()
 
     def reset(self) -> None:
         """Learn the hum again, because the clock may have been reset. Compare the next frame with no earlier one."""
-        self._reference_pC: Array | None = None
+        self._reference_pC: Array | None = None  # charges of the frame with which the next frame is compared
         self._learned_s = 0.0  # time over which the hum has been learned
 
     def step(self, frame: Frame) -> None:
@@ -87,30 +88,32 @@ class Hum(Stage):
         unit_phasor = cmath.exp(2j * math.pi * rule.frequency_Hz * frame.clock_s)  # u
         phasor_step = unit_phasor - self._reference_phasor  # z
         squared_step = abs(phasor_step) ** 2
-        self._elapsed_s += frame.dt_s  # since the reference
+        self._reference_age_s += frame.dt_s
 
         # If the unit phasor has hardly changed, the change of the charges contains little hum.
         has_turned = squared_step > MIN_SQUARED_STEP
         if self._reference_pC is not None and has_turned:
-            expected_change_pC = (self._phasor_pC * phasor_step).real
+            expected_change_pC = (self._hum_phasor_pC * phasor_step).real
             error_pC = raw_pC - self._reference_pC - expected_change_pC
             # Clipping limits the influence of a touch, which may change the charges by more than the hum.
             clipped_error_pC = error_pC.clip(-rule.limit_pC, rule.limit_pC)
-            # The charges contain only the real part of the product. With a gain of 1, a frame therefore corrects only
-            # half of the error of the phasor on average. With the factor 2, the time constant is `settle_s`. Until this
-            # time has passed, the errors are averaged over the time so far, so that the first tare contains little hum.
-            self._learned_s += self._elapsed_s
+            # The estimate averages the errors over `settle_s`. Until this time has passed, it averages them over the
+            # time so far, so that the first tare contains little hum. The tolerance avoids a division by 0.
+            self._learned_s += self._reference_age_s
             averaging_s = max(min(rule.settle_s, self._learned_s), SUM_TOLERANCE_s)
-            gain = min(1.0, 2.0 * self._elapsed_s / averaging_s)
+            # The charges contain only the real part of the product p z. With a gain of 1, a frame therefore corrects
+            # only half of the error of the phasor on average. With the factor 2, the time constant is `averaging_s`.
+            gain = min(1.0, 2.0 * self._reference_age_s / averaging_s)
+            # The smallest change of p for which the real part of p z changes by `error` is error * conj(z) / |z|^2.
             correction_per_error = gain / squared_step * phasor_step.conjugate()
-            self._phasor_pC = self._phasor_pC + clipped_error_pC * correction_per_error
+            self._hum_phasor_pC = self._hum_phasor_pC + clipped_error_pC * correction_per_error
         # The unit phasor turns enough within a tenth of a period, except if the frames are nearly whole periods apart.
-        is_old = self._elapsed_s > 0.1 / rule.frequency_Hz
+        is_old = self._reference_age_s > 0.1 / rule.frequency_Hz
         if self._reference_pC is None or has_turned or is_old:
             self._reference_phasor = unit_phasor
             self._reference_pC = raw_pC
-            self._elapsed_s = 0.0
-        frame.charge_pC = raw_pC - (self._phasor_pC * unit_phasor).real
+            self._reference_age_s = 0.0
+        frame.charge_pC = raw_pC - (self._hum_phasor_pC * unit_phasor).real
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:

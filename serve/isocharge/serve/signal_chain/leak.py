@@ -77,26 +77,35 @@ class Inflow:
     def __init__(self, rule: LeakRule, n_electrode: int) -> None:
         """Begin with an inflow of zero.
 
+        The inflow is the slow current that flows into each amplifier without a touch, pC/s.
+
         Args:
             rule: Settings of the estimate.
             n_electrode: Number of electrodes.
         """
         self._rule = rule
-        self._trusted_pC_per_s = np.zeros(n_electrode)  # mean inflow of an interval, at least `look_back_s` ago
-        self.pause()
-        self.learned_s = 1.0  # as if the inflow had been zero for one second
-        self.hold_s = 0.0
+        # During a touch, the trusted inflow is used. It is the mean of an interval that had ended `look_back_s` or more
+        # before the touch was detected, so that the touch cannot have changed it.
+        self._trusted_pC_per_s = np.zeros(n_electrode)
+        self.pause()  # sets the present inflow to the trusted one, and begins the first interval
+        self.learned_s = 1.0  # time over which the inflow was averaged, as if it had been zero for one second
+        self.hold_s = 0.0  # remaining time in which the inflow is not learned; `pause` has set it for a release
 
     def pause(self) -> None:
-        """Use the trusted inflow during a touch, and for some time after its release."""
+        """Use the trusted inflow during a touch, and do not learn for the time `hold_off_s` after its release.
+
+        The inflow is the slow current into each amplifier, pC/s. Each frame of a touch calls this method. The latest
+        estimates may contain a part of the touch charge. They are therefore replaced by the trusted inflow, which is
+        older than the touch.
+        """
         self.pC_per_s = self._trusted_pC_per_s
         self._candidate_pC_per_s = self._trusted_pC_per_s  # becomes the trusted inflow when its age is `look_back_s`
         self._candidate_age_s = 0.0
-        self._new_pC_per_s = [self.pC_per_s]  # inflows in the present interval, whose mean is the next candidate
-        self.hold_s = self._rule.hold_off_s
+        self._interval_inflows_pC_per_s = [self.pC_per_s]  # in the present interval; their mean is the next candidate
+        self.hold_s = self._rule.hold_off_s  # remaining time of the pause
 
     def learn(self, surplus_pC: Array, noise_pC: Array, dt_s: float) -> None:
-        """Use a frame out of contact to update the inflow.
+        """Use a frame out of contact to update the inflow (`pC_per_s`), the slow current into each amplifier.
 
         The surplus is the part of the new charge that the estimated inflow does not explain. The surplus is divided by
         an averaging time and added to the inflow, so that the estimate becomes the mean current over this time. Large
@@ -125,14 +134,15 @@ class Inflow:
         if averaging_s > 0.0:  # frames may have come within one count of a slow clock
             self.pC_per_s = self.pC_per_s + clipped_surplus_pC / averaging_s
 
-        # Replace the trusted inflow and the candidate if the candidate is old enough.
-        self._new_pC_per_s.append(self.pC_per_s)
+        # Replace the trusted inflow and the candidate if the candidate is old enough. The tolerance allows for the
+        # rounding errors of the summed times.
+        self._interval_inflows_pC_per_s.append(self.pC_per_s)
         self._candidate_age_s += dt_s
         if self._candidate_age_s >= rule.look_back_s - SUM_TOLERANCE_s:
             self._trusted_pC_per_s = self._candidate_pC_per_s
-            self._candidate_pC_per_s = np.mean(self._new_pC_per_s, axis=0)
+            self._candidate_pC_per_s = np.mean(self._interval_inflows_pC_per_s, axis=0)
             self._candidate_age_s = 0.0
-            self._new_pC_per_s = [self.pC_per_s]
+            self._interval_inflows_pC_per_s = [self.pC_per_s]
 
 
 class Leak(Stage):
@@ -151,7 +161,8 @@ class Leak(Stage):
     def reset(self) -> None:
         """Discard the state. A new state begins at the first frame after the next tare."""
         self._previous: Frame | None = None
-        self._output_pC = np.zeros(len(self._tau_s))  # output of the amplifiers above the tare; 0 is its mean at rest
+        # Output of the amplifiers in the previous frame. The tare has been subtracted, so its mean at rest is 0.
+        self._output_pC = np.zeros(len(self._tau_s))
         self._charge_pC = np.zeros(len(self._tau_s))  # touch charge
         self._is_falsified = False  # whether a gap may have falsified the charge of this touch
         self._inflow = Inflow(self._rule, len(self._tau_s))
@@ -159,24 +170,26 @@ class Leak(Stage):
     def step(self, frame: Frame) -> None:
         """Replace the output of the amplifiers by the touch charge.
 
-        If missing frames may have falsified the touch charge, the frame gets the flag `gap`.
+        If missing frames may have falsified the touch charge, the frame gets the flag `gap`. The frame also gets
+        `base_relax_s`, the time constant with which the touch detection forgets charges that belong to no touch.
         """
         output_pC = frame.charge_pC
         if output_pC is None:
             return
-        self._advance(frame, self._previous or frame, output_pC)
+        self._advance(frame, self._previous or frame, output_pC)  # updates `_charge_pC` and `_is_falsified`
         if self._is_falsified:
             frame.flags.append(GAP)
         self._previous = frame
-        self._output_pC = output_pC
+        self._output_pC = output_pC  # the next frame is compared with this output
         frame.charge_pC = self._charge_pC
         frame.base_relax_s = self._rule.relax_s
 
     def _advance(self, frame: Frame, previous: Frame, output_pC: Array) -> None:
         """Add the charge that is new since the previous frame to the touch charge (`_charge_pC`).
 
-        The new charge is i - b dt, with the symbols at the beginning of this module. The innovation i is the change of
-        the output that the leak does not explain. The inflow b is a slow current into the amplifiers, pC/s.
+        The new charge is i - b dt. The innovation i is the change of the output that the leak does not explain. The
+        inflow b is a slow current into the amplifiers, pC/s, and dt is the time since the previous frame. The share
+        a = exp(-dt / tau) of a charge remains after the leak of this time.
 
         Out of contact, the touch charge should be zero, so it decays to zero. Except during a pause after a release,
         the inflow is then learned from the new charge. If frames are missing during a touch, the touch may have ended
@@ -196,7 +209,8 @@ class Leak(Stage):
         innovation_pC = self._innovation_pC(output_pC, decay)  # i
         surplus_pC = innovation_pC - self._inflow.pC_per_s * dt_s  # i - b dt: new touch charge and noise
 
-        # Out of contact, let the touch charge decay, and learn the inflow unless it is paused.
+        # Out of contact, let the touch charge decay, and learn the inflow unless it is paused. `hold_s` is the rest of
+        # the pause. The tolerance allows for the rounding errors of the summed times.
         if previous.is_contact:
             self._inflow.pause()
         else:
@@ -212,11 +226,12 @@ class Leak(Stage):
         if has_gap and previous.is_contact and self._has_ended_in_gap(frame, surplus_pC):
             self._is_falsified = False
             surplus_pC = -self._charge_pC  # so that no touch charge remains
-            has_gap = False
+            has_gap = False  # so that the gap is not checked for a wrong charge
         self._charge_pC = self._charge_pC + surplus_pC
         if has_gap:
             # The surplus is right if the charge arrived evenly in the gap. A charge that arrived at the beginning of
-            # the gap is larger by the factor (1 + 1/a) / 2, which is 1 + (1/a - 1) / 2.
+            # the gap is larger by the factor (1 + 1/a) / 2, which is 1 + (1/a - 1) / 2. `_inverse_decay` returns 1/a,
+            # limited so that a long gap causes no overflow.
             largest_error_pC = np.abs(surplus_pC) * (self._inverse_decay(frame) - 1.0) / 2.0
             if self._is_large(largest_error_pC, frame):
                 self._is_falsified = True
@@ -245,6 +260,10 @@ class Leak(Stage):
         to cause the present output. The cancelling charge is therefore largest if it arrived at the beginning of the
         gap. If even this largest charge does not cancel the touch charge, the touch has not ended.
 
+        Of a charge that arrived at the beginning of the gap, the leak leaves the share a. Of a charge that arrived
+        evenly in the gap, the leak leaves the share (1 + a) / 2. For the same output, the first charge is therefore
+        (1 + a) / (2 a) = (1 + 1/a) / 2 times the second.
+
         Args:
             frame: The frame after the gap.
             surplus_pC: New touch charge, if it arrived evenly in the gap, shape (n_electrode,), pC.
@@ -254,8 +273,8 @@ class Leak(Stage):
         # The output may differ from zero by four standard deviations of the noise, or by 5 % of the charge, because the
         # time constant and the inflow have errors.
         margin_pC = np.maximum(4.0 * frame.noise_pC, 0.05 * np.abs(self._charge_pC))
-        # A charge that arrived at the beginning of the gap is (1 + 1/a) / 2 times the surplus. The margin applies after
-        # the leak of the gap. It corresponds to a margin that is larger by the factor 1/a before this leak.
+        # Touch charge that remains if the new charge arrived at the beginning of the gap. It is a charge before the
+        # leak of the gap, but the margin is a charge after this leak. The margin is therefore multiplied by 1/a.
         remaining_pC = self._charge_pC + surplus_pC * (1.0 + inverse_decay) / 2.0
         return bool((sign * remaining_pC <= inverse_decay * margin_pC).all())
 
@@ -290,29 +309,26 @@ class Integrator(Leak):
     front_end = "current"
 
     def reset(self) -> None:
-        """Discard the state."""
-        super().reset()
-        # The first frames correct the inflow completely, because it does not begin with a prior of zero. The tare has
-        # already subtracted an offset, but it is the mean of only a few currents, and its error would add up.
+        """Discard the integral of the currents, the estimated inflow, and the mean sampling interval.
+
+        The inflow is the offset of the currents, which is subtracted from each current before it is added.
+        """
+        super().reset()  # also creates a new `_inflow`, which is zero
+        # The tare has already subtracted an offset. This offset is the mean of only a few currents, so it has an error,
+        # which would add up in the integral. The inflow learns this error from the first frames. `learned_s` is the
+        # time over which the inflow was averaged. With 0 s, the initial inflow of zero has no weight in the average.
         self._inflow.learned_s = 0.0
-        self._current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
+        self._previous_current_pC = np.zeros(len(self._tau_s))  # current of the previous valid frame
         self._elapsed_s = 0.0  # time over which the mean sampling interval is computed
-        self._interval_count = 1  # sampling intervals in this time, and one more, which avoids a division by 0
-        self._touch_count = 0  # sampling intervals of the present touch; 0 at rest
+        self._interval_count = 1  # number of sampling intervals in this time, plus 1 to avoid a division by 0
+        self._touch_intervals = 0  # sampling intervals of the present touch; 0 at rest
 
     def step(self, frame: Frame) -> None:
         """Replace the currents by the charges, and the noise of the currents by the noise of the charges.
 
-        The current of a missing frame is assumed to be the mean of the currents before and after the gap. If this mean
-        is so small that it may be only noise, the current is assumed to be the estimated offset (the inflow) instead.
-        The mean of two noisy currents would multiply the noise by the number of missing frames. The touch gets the flag
-        `gap` if the error of the assumed current may exceed both the noise and 1 % of the charge. A copy of the
-        previous frame adds no charge, and neither does a frame that arrives late.
-
-        At rest, the charges decay with the time constant `relax_s`. For currents that are independent and have the
-        sampling interval dt, the variance of their sum is then relax_s / (2 dt) times the variance of one current.
-        During a touch of n currents, the charges do not decay, and each current adds its variance. The inflow is the
-        mean of the currents in the time T before the touch. Its error adds n^2 dt / T times this variance.
+        The charges are the sum of the currents minus the inflow, the estimated offset of the currents. A current is
+        stated as its charge in one sampling interval, pC. The touch gets the flag `gap` if currents of missing frames
+        may have caused an error that exceeds both the noise and 1 % of the charge.
         """
         self._elapsed_s += frame.dt_s
         self._interval_count += frame.intervals
@@ -321,29 +337,37 @@ class Integrator(Leak):
         if current_pC is None:
             return
         is_touched = self._previous is not None and self._previous.is_contact
-        self._touch_count = self._touch_count + frame.intervals if is_touched else 0
+        self._touch_intervals = self._touch_intervals + frame.intervals if is_touched else 0
 
-        # Add the assumed charges of the missing frames. A current is the charge of one sampling interval.
+        # Add the assumed charges of the missing frames. The current of a missing frame is assumed to be the mean of the
+        # currents before and after the gap. If this mean is so small that it may be only noise, the current is assumed
+        # to be the inflow instead. The mean would otherwise multiply the noise by the number of missing frames.
         interval_s = max(self._elapsed_s / self._interval_count, SUM_TOLERANCE_s)  # mean sampling interval
         inflow_pC = self._inflow.pC_per_s * interval_s
-        mean_pC = (current_pC + self._current_pC) / 2.0
-        may_be_noise = np.abs(mean_pC) <= 3.0 * frame.noise_pC
-        missing_pC = missing_count * np.where(may_be_noise, inflow_pC, mean_pC)
+        mean_current_pC = (current_pC + self._previous_current_pC) / 2.0
+        may_be_noise = np.abs(mean_current_pC) <= 3.0 * frame.noise_pC
+        missing_pC = missing_count * np.where(may_be_noise, inflow_pC, mean_current_pC)
         frame.charge_pC = current_pC + missing_pC
         if frame.intervals == 0:  # a copy of the previous frame, or a late frame that has counted as missing
             frame.charge_pC = np.zeros_like(current_pC)
-        super().step(frame)
+        super().step(frame)  # adds `charge_pC` to the integral, and replaces it by the integral
 
-        # Mark the touch if the error of the assumed charges may be large. If the missing currents lie between the
-        # currents before and after the gap, each differs from their mean by at most half of their difference.
-        error_pC = missing_count * np.abs(current_pC - self._current_pC) / 2.0
-        self._current_pC = current_pC
-        rest_ratio = max(1.0, 0.5 * self._rule.relax_s / interval_s)  # of the variances
+        # If the missing currents lie between the currents before and after the gap, each differs from their mean by at
+        # most half of their difference.
+        error_pC = missing_count * np.abs(current_pC - self._previous_current_pC) / 2.0
+        self._previous_current_pC = current_pC
+
+        # The ratios are variances of the charges, divided by the variance of one current. At rest, the charges decay
+        # with the time constant `relax_s`. The variance of a sum of independent currents with the sampling interval dt
+        # is then relax_s / (2 dt) times that of one current. In a touch of n currents, the charges do not decay, and
+        # each current adds its variance. The inflow is the mean of the currents in the time T before the touch. Its
+        # error adds n^2 dt / T times the variance of one current.
+        rest_variance_ratio = max(1.0, 0.5 * self._rule.relax_s / interval_s)
         averaging_s = max(min(self._rule.settle_s, self._inflow.learned_s), interval_s)  # T
-        touch_ratio = self._touch_count + self._touch_count**2 * interval_s / averaging_s
-        frame.noise_pC = frame.noise_pC * math.sqrt(rest_ratio + touch_ratio)
-        if self._is_large(error_pC, frame):
-            self._is_falsified = True
+        touch_variance_ratio = self._touch_intervals + self._touch_intervals**2 * interval_s / averaging_s
+        frame.noise_pC = frame.noise_pC * math.sqrt(rest_variance_ratio + touch_variance_ratio)
+        if self._is_large(error_pC, frame):  # compared with the noise and with the touch charge
+            self._is_falsified = True  # so that the later frames of the touch get the flag, too
             frame.flags.append(GAP)
 
     def _innovation_pC(self, output_pC: Array, decay: Array) -> Array:

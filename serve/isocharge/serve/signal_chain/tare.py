@@ -42,7 +42,7 @@ class TareRule(Rule, frozen=True, kw_only=True):
     relax_s: Divisor = 2.0
 
     def unrest(self, mean_pC: Array, noise_pC: Array) -> str:
-        """Return the reason why something seems to touch the film in some frames; empty if nothing touches the film.
+        """Return a text with the reason why some frames are not quiet; empty if nothing seems to touch the film.
 
         Args:
             mean_pC: Mean charge of each electrode in the frames, shape (n_electrode,), pC.
@@ -79,24 +79,27 @@ class Tare(Stage):
     is_default = True
 
     def __init__(self, setup: Setup) -> None:
-        """Begin without a tare."""
-        self._rule = setup.device.rule(TareRule)
+        """Begin without a tare, the charges of the untouched film that are subtracted from all charges."""
+        self._rule = setup.device.rule(TareRule)  # None if the device file switches the tare off
         if self._rule is not None and setup.device.has_currents:  # at rest, a current of any size is an offset
             self._rule = structs.replace(self._rule, offset_limit_pC=math.inf)
         self._electrodes = setup.electrodes
-        # Whether the tare follows the drift and the warming, because no later stage does
-        self._follows = LeakRule not in setup.device.rules and not setup.device.has_currents
+        # True if no later stage corrects the drift of the charge at rest and the warming, so the tare must follow them
+        self._follows_drift = LeakRule not in setup.device.rules and not setup.device.has_currents
         self._tare_pC: Array | None = None  # charge at rest
         self._noise_pC = np.zeros(len(setup.electrodes))  # standard deviation of the charge at rest
         self._previous: Frame | None = None  # previous frame
-        rule = self._rule or TareRule()
+        rule = self._rule or TareRule()  # without a tare, both numbers below have no effect
         self._latest_pC: deque[Array] = deque(maxlen=rule.frames)  # charges from which the tare is measured
-        self._remaining_frames = rule.patience or math.inf  # number of frames after which the search ends with an error
+        # Number of frames after which the search ends with an error; a patience of 0 means no limit
+        self._remaining_frames = rule.patience or math.inf
 
     def step(self, frame: Frame) -> None:
         """Subtract the tare from a frame. Without a tare, search for one, and remove the charges from the frame.
 
-        If the tare follows a drift, each frame changes the tare by the drift that the previous frame shows.
+        The tare is the charge of the untouched film. If the tare follows a drift, each frame changes the tare by the
+        drift that the previous frame shows. Only of the previous frame is it known whether something touches the film,
+        because the stages after this one detect a touch.
 
         Raises:
             TareError: If the film is touched during the whole search for a tare.
@@ -108,12 +111,13 @@ class Tare(Stage):
             frame.charge_pC = None
             frame.flags.append(TARE)
             return
-        if self._follows:
+        if self._follows_drift:
             if self._previous is not None:
-                self._tare_pC = self._tare_pC + self._change_pC(self._previous)
+                self._tare_pC = self._tare_pC + self._tare_change_pC(self._previous)
             # The touch detection keeps a base, the charges that belong to no touch. The base decays as fast as the tare
             # takes over the charge at rest. A base that remains of the latest touch is held and does not decay, because
-            # a finger that is leaving the film may still cause it.
+            # a finger that is leaving the film may still cause it. The touch detection applies `is_base_held` only to
+            # such a base.
             frame.is_base_held = True
             if self._rule is not None:
                 frame.base_relax_s = self._rule.relax_s
@@ -132,12 +136,13 @@ class Tare(Stage):
         self._latest_pC.clear()
         self._remaining_frames = math.inf
 
-    def _change_pC(self, frame: Frame) -> Array | float:
+    def _tare_change_pC(self, frame: Frame) -> Array | float:
         """Return the change of the tare after a frame, shape (n_electrode,) or one number, pC.
 
-        While something touches the film, only the warming of the film changes the tare. Otherwise, the film is at rest,
-        and the tare approaches the charges of the frame with the time constant `relax_s`. A large charge may be the
-        beginning of a touch, and counts only up to `noise_limit_pC`.
+        While something touches the film, only the warming of the film changes the tare. The same applies if the tare is
+        switched off. Otherwise, the film is at rest, and the tare approaches the charges of the frame with the time
+        constant `relax_s`. These charges contain the warming. A large charge may be the beginning of a touch, and
+        counts only up to `noise_limit_pC`.
 
         Args:
             frame: The frame, whose charges no longer contain the tare.
@@ -152,7 +157,8 @@ class Tare(Stage):
     def _search(self, frame: Frame, charge_pC: Array) -> None:
         """Add a frame to the latest frames, and measure the tare if there are enough frames and they are quiet.
 
-        If the tare is switched off, the tare is 0.
+        The latest frames are at most `TareRule.frames`, and the oldest is forgotten. If the tare is switched off, the
+        tare is 0.
 
         Args:
             frame: The frame.
@@ -172,7 +178,7 @@ class Tare(Stage):
         latest_pC = np.array(self._latest_pC)  # shape (frames, n_electrode)
         mean_pC = latest_pC.mean(axis=0)
         noise_pC = latest_pC.std(axis=0)
-        reason = rule.unrest(mean_pC, noise_pC)
+        reason = rule.unrest(mean_pC, noise_pC)  # why the frames are not quiet; empty if they are
         if not reason:
             self._tare_pC = mean_pC
             self._noise_pC = noise_pC

@@ -93,9 +93,9 @@ class Warming(Stage):
     def step(self, frame: Frame) -> None:
         """Estimate the warming during a touch, subtract the charge that a change of the warming causes, and add flags.
 
-        The tare has already subtracted the charge of the earlier changes, and reads the present change from the frame.
-        While an amplifier is saturated, the warming is not estimated, because then the charges fit no contact for any
-        value of the warming.
+        Earlier stages have already subtracted the charge of the earlier changes, and read the present change from the
+        frame (`warming_pC`) when the next frame comes. While an amplifier is saturated, the warming is not estimated,
+        because then the charges fit no contact for any value of the warming.
         """
         if frame.charge_pC is None:
             return
@@ -104,25 +104,27 @@ class Warming(Stage):
             return
         if SATURATED in frame.flags:
             return
+        # `_estimate` returns the change of the common charge. Each electrode has its own known ratio to this charge.
         change_pC = self._estimate(frame.charge_pC, frame.noise_pC, frame.dt_s) * self._ratios
         frame.charge_pC = frame.charge_pC - change_pC
         frame.warming_pC = change_pC
         frame.warming_error_pC = math.sqrt(self._variance_pC2) * self._ratios
-        if frame.is_base_held and frame.tare_pC is not None:  # the warming is a part of the tare
+        if frame.is_base_held and frame.tare_pC is not None:  # the tare follows the warming
             frame.tare_pC = frame.tare_pC + change_pC
-        if abs(self._charge_pC) >= self._rule.tell_pC:
+        if abs(self._charge_pC) >= self._rule.tell_pC:  # the common charge since the beginning of the touch
             frame.flags.append(THERMAL)
         if self._is_blind:
             frame.flags.append(BLIND)
 
     def _estimate(self, charge_pC: Array, noise_pC: Array, dt_s: float) -> float:
-        """Update the estimate of the charge p that warming has added to each electrode, and return its change, pC.
+        """Update the estimate of the common charge p that warming has added, and return its change, pC.
 
-        A Kalman filter computes the estimate (`_charge_pC`) and its variance (`_variance_pC2`). A change of p is
-        measured as follows. Trial values of the change are subtracted from the charges. The misfit of a trial value is
-        the distance of the remaining charges from the charges of the nearest contact. A parabola is fitted to the
-        squared misfits, and its minimum is the measured change. If the parabola is too flat, warming cannot be
-        distinguished from force. The estimate is then not changed.
+        Warming adds the charge p times `_ratios[i]` to the electrode i. A Kalman filter computes the estimate
+        (`_charge_pC`) and its variance (`_variance_pC2`). A change of p is measured as follows. Trial values of the
+        change are subtracted from the charges. The misfit of a trial value is the distance of the remaining charges
+        from the charges of the nearest contact. A parabola is fitted to the squared misfits, and its minimum is the
+        measured change. If the parabola is too flat, warming cannot be distinguished from force. The estimate is then
+        not changed.
 
         Args:
             charge_pC: Touch charges from which the present estimate has been subtracted, shape (n_electrode,), pC.
@@ -133,18 +135,20 @@ class Warming(Stage):
         self._waited_s += dt_s
         if self._waited_s < rule.every_s - SUM_TOLERANCE_s:  # no estimate in this frame
             return 0.0
-        # The common charge changes like a random walk, whose variance increases in proportion to the time.
+        # The common charge changes like a random walk, whose variance increases in proportion to the time. In one
+        # second, it changes by the standard deviation `wander_pC`.
         self._variance_pC2 += rule.wander_pC**2 * self._waited_s
         self._waited_s = 0.0
 
-        # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change.
+        # Fit: squared misfit = constant + slope * c + curvature * c^2, where c is the trial value of the change. The
+        # trial values are `TRIED_PC`. The product with the matrix `_PARABOLA_FIT` is the least-squares fit.
         trial_charges_pC = charge_pC - TRIED_PC[:, np.newaxis] * self._ratios  # shape (trials, n_electrode)
         predictor = self._setup.model.for_measured_noise(noise_pC)
         squared_misfits = np.square(predictor.predict_batch(trial_charges_pC).misfit, dtype=float)
         _constant, slope, curvature = (_PARABOLA_FIT @ squared_misfits).tolist()
 
         # The variance of the minimum is the inverse of the curvature, because the misfit is in standard deviations.
-        # Errors of the model multiply it by `noise` squared.
+        # Errors of the model multiply the standard deviation by the factor `noise`.
         estimate_variance_pC2 = rule.noise**2 / curvature if curvature > 0.0 else math.inf
         self._is_blind = estimate_variance_pC2 > rule.blind_pC**2
         if self._is_blind:
@@ -162,20 +166,22 @@ class Warming(Stage):
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
-        """Return the settings of the section `[common_mode]` for the C sources, by name; empty without this section.
+        """Return the settings of the section `[common_mode]` for the C sources, by name.
 
-        The C sources assume that a warming adds the same charge to all electrodes.
+        The result is empty if the device file has no such section. The C sources assume that a warming adds the same
+        charge to all electrodes.
 
         Args:
             setup: Device file and model for which C sources are written.
 
         Raises:
-            DeviceError: If `pC_per_K` states a charge for each electrode, or if the model has too few electrodes.
+            DeviceError: If the section has the key `pC_per_K`, which states a charge for each electrode, or if the
+                model has too few electrodes.
         """
         settings = super().c_settings(setup)
         if settings:
             warming_ratios(setup)  # only to raise its error for too few electrodes
-        charge_pC_per_K = settings.pop("pC_per_K", None)
+        charge_pC_per_K = settings.pop("pC_per_K", None)  # the C sources have no such setting
         if charge_pC_per_K is not None:
             raise DeviceError(f"{setup.device.where}: common_mode.pC_per_K: {NOT_IN_C}")
         return settings
@@ -183,6 +189,8 @@ class Warming(Stage):
 
 def warming_ratios(setup: Setup) -> Array:
     """Return the charge that warming adds to each electrode, relative to the mean magnitude over all electrodes.
+
+    Warming can only be estimated with at least four electrodes, so the number of electrodes is checked first.
 
     Returns:
         Ratios, shape (n_electrode,), dimensionless. All ratios are 1 if the device file does not state

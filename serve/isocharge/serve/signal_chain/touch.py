@@ -51,11 +51,12 @@ class TouchRule(Rule, frozen=True, kw_only=True):
         )
 
     def threshold_pC(self, noise_pC: Array) -> Array:
-        """Return the touch threshold of each electrode, shape (n_electrode,), pC. The settings must be resolved.
+        """Return the touch threshold of each electrode, shape (n_electrode,), pC.
 
         The threshold has two parts. The first part is a multiple of the noise, and the noise of all electrodes together
         rarely exceeds this part. The second part is constant, and is called the floor. The norm of the noise of n
-        electrodes, in standard deviations, has a mean of about sqrt(n) and a standard deviation of about sqrt(1/2).
+        electrodes, in standard deviations, has a mean of about sqrt(n) and a standard deviation of about sqrt(1/2). The
+        settings must come from the method `resolved`, which replaces a floor of None by a number.
 
         Args:
             noise_pC: Standard deviation of the charge of each electrode at rest, shape (n_electrode,), pC.
@@ -119,18 +120,19 @@ class Touch(Stage):
         """Begin without a touch."""
         self._setup = setup
         rule = setup.device.rule(TouchRule)
+        # None if the detection is switched off. `resolved` sets the default thresholds for charges or for currents.
         self._rule = None if rule is None else rule.resolved(has_currents=setup.device.has_currents)
-        # Expected directions of the charges without an earlier touch: that of equal positive charges, and the zero
-        # vector, which accepts every direction, for touches whose charges may have any sign.
-        self._positive_direction = np.ones(len(setup.electrodes))
-        self._any_direction = np.zeros(len(setup.electrodes))
+        # Expected direction of the charges of a touch if there was no earlier touch. The length of the vector does not
+        # matter. The second vector is used if the charges of a touch may have any sign.
+        self._positive_direction = np.ones(len(setup.electrodes))  # equal positive charges
+        self._any_direction = np.zeros(len(setup.electrodes))  # every direction is accepted
         self._noise_pC: Array | None = None  # noise of the latest tare
         self._threshold_pC = np.zeros(0)  # touch thresholds of the electrodes with this noise
         self.reset()
 
     def reset(self) -> None:
         """Discard the touch."""
-        no_charge = np.zeros(len(self._setup.electrodes))
+        no_charge = np.zeros(len(self._setup.electrodes))  # shared, because no array is changed in place
         # Charges and sizes are relative to the touch thresholds. The size of charges is the norm of their vector.
         self._touch_direction = no_charge  # sum of the directions of the frames of the latest touch
         self._base_charge = no_charge  # charges that are no touch
@@ -140,7 +142,7 @@ class Touch(Stage):
         self._may_have_drifted = False  # whether the charge at rest may have drifted before this touch
         self._is_contact = False
         self._peak_size = 0.0  # largest size in this touch
-        self._rest_s = math.inf  # time for which the charges have been small
+        self._quiet_s = math.inf  # time for which the charges have been small
 
     def step(self, frame: Frame) -> None:
         """Determine whether something touches the film in this frame. A frame without charges is not changed."""
@@ -149,33 +151,34 @@ class Touch(Stage):
         if self._rule is None:  # the detection is switched off, so every frame counts as a contact
             self._is_contact = True
         else:
-            has_new_noise = frame.noise_pC is not self._noise_pC  # the film was tared, or the board sends currents
+            # An array is never changed in place. Another array is therefore another noise: the film was tared, or the
+            # board sends currents.
+            has_new_noise = frame.noise_pC is not self._noise_pC
             if has_new_noise and not self._is_contact:
                 self._noise_pC = frame.noise_pC
                 self._threshold_pC = self._rule.threshold_pC(frame.noise_pC)
             charge = frame.charge_pC / self._threshold_pC
             size = math.sqrt(charge @ charge)
             if self._is_contact:
-                self._continue(self._rule, charge, size)
+                self._step_in_touch(self._rule, charge, size)
             else:
-                self._await(frame, charge, size)
+                self._step_without_touch(frame, charge, size)
             self._previous_charge = charge
             self._previous_size = size
         frame.is_contact = self._is_contact
         if self._is_contact and self._may_have_drifted:
             frame.flags.append(DRIFT)
 
-    def _continue(self, rule: TouchRule, charge: Array, size: float) -> None:
+    def _step_in_touch(self, rule: TouchRule, charge: Array, size: float) -> None:
         """Update the present touch with the charges of a frame, or end the touch.
 
         Args:
             rule: Thresholds.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
-            size: Size of the charges.
+            size: Size of the charges, which is the norm of their vector. A size of 1 is the touch threshold.
         """
-        # Update the peak, from which the release threshold follows. The touch threshold is the size 1, and the release
-        # threshold is at least half of it. A smaller release threshold of a weak touch could be below the noise, so the
-        # touch would never end.
+        # Update the peak, from which the release threshold follows. The release threshold is at least half of the touch
+        # threshold. A smaller release threshold of a weak touch could be below the noise, so the touch would never end.
         held_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
         self._peak_size = max(self._peak_size, held_size)
         half_threshold = 0.5
@@ -183,21 +186,22 @@ class Touch(Stage):
 
         # End the touch if the charges are small, or have changed their sign. If charges may have any sign, they are
         # compared with those of the previous frame. Otherwise, most charges of a touch are positive, as is their sum.
-        usual_charge = self._previous_charge if self._setup.has_any_sign else self._positive_direction
-        is_reversed = charge @ usual_charge < 0.0
+        expected_direction = self._previous_charge if self._setup.has_any_sign else self._positive_direction
+        is_reversed = charge @ expected_direction < 0.0
         if size < release_size or is_reversed:
             self._is_contact = False
-            self._base_charge = charge
-            self._idle_mean_charge = charge
-            self._rest_s = 0.0
+            self._base_charge = charge  # the charges that remain of the touch
+            self._idle_mean_charge = charge  # beginning of the exponential mean of the charges out of contact
+            self._quiet_s = 0.0  # time for which the charges have been small
         else:
-            self._touch_direction = self._touch_direction + charge / size
+            self._touch_direction = self._touch_direction + charge / size  # sum over the frames of the touch
 
-    def _await(self, frame: Frame, charge: Array, size: float) -> None:
+    def _step_without_touch(self, frame: Frame, charge: Array, size: float) -> None:
         """Process a frame while nothing touches the film: begin a touch, or update the base.
 
         The base (`_base_charge`) contains the charges that belong to no touch. Out of contact, the base decays to zero.
-        The change is the difference between the charges and the base. The first rule in this list that applies is used:
+        It does not decay if it remains of the latest touch, and the frame has `is_base_held`. The change is the
+        difference between the charges and the base. The first rule in this list that applies is used:
 
         - If the change is opposite to the expected direction, a release or a drift has caused the change. The base
           becomes the mean of the latest charges (`_idle_mean_charge`).
@@ -206,16 +210,20 @@ class Touch(Stage):
         - If the base is a remainder of the latest touch, and the charges are smaller than the base, the charges become
           the new base.
 
+        Unless a touch begins, the exponential mean of the charges out of contact is then updated.
+
         While charges of the latest touch may remain, the expected direction is the direction of the latest touch.
         Later, the expected charges are positive and equal. If touches may have charges of any sign, the expected
-        direction is the zero vector, with which every direction is accepted.
+        direction is then the zero vector, with which every direction is accepted.
 
         Args:
             frame: The frame.
             charge: Charges relative to the touch thresholds, shape (n_electrode,), dimensionless.
             size: Size of the charges, which is the norm of their vector. A size of 1 is the threshold.
         """
-        if self._rest_s >= RISE_S - SUM_TOLERANCE_s:  # the charges have been small for some time
+        # After some time with small charges, the latest touch no longer matters. The tolerance allows for the rounding
+        # errors of the summed times.
+        if self._quiet_s >= RISE_S - SUM_TOLERANCE_s:
             self._touch_direction = self._any_direction if self._setup.has_any_sign else self._positive_direction
         direction = self._touch_direction
         # Charges are opposite if their scalar product with `direction` is below this limit times their size.
@@ -239,9 +247,10 @@ class Touch(Stage):
             # of the threshold, or the base was opposite to the touch, so that the change is larger than the charges.
             # For currents, the limit is higher, because the sum of their noise changes slowly, like a drift.
             drift_limit = 0.75 if self._setup.device.has_currents else 0.5
-            slow_rise = self._idle_mean_charge - self._base_charge
-            slow_rise_size = math.sqrt(slow_rise @ slow_rise)
-            self._may_have_drifted = max(slow_rise_size, change_size - size) > drift_limit
+            earlier_rise = self._idle_mean_charge - self._base_charge  # before this frame
+            earlier_rise_size = math.sqrt(earlier_rise @ earlier_rise)
+            # A base that is opposite to the touch makes `change_size` larger than `size`.
+            self._may_have_drifted = max(earlier_rise_size, change_size - size) > drift_limit
             return
         elif is_remainder and size < math.sqrt(self._base_charge @ self._base_charge):
             self._base_charge = charge  # the charge that remains of the latest touch becomes smaller
@@ -252,7 +261,7 @@ class Touch(Stage):
         self._idle_mean_charge = charge + decay * (self._idle_mean_charge - charge)
         if size > 1.0 and charge @ direction < 0.0:
             frame.flags.append(NEGATIVE)
-        self._rest_s = 0.0 if size > 1.0 else self._rest_s + frame.dt_s
+        self._quiet_s = 0.0 if size > 1.0 else self._quiet_s + frame.dt_s
 
     @classmethod
     def c_settings(cls, setup: Setup) -> dict[str, Any]:
