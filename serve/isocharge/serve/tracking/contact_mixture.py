@@ -96,6 +96,9 @@ class ContactHypothesis(NamedTuple):
     def contact_after(self, dt_s: float, misfit: float) -> Contact:
         """Return the contact after the time `dt_s`. The covariance is taken as constant, because the time is short.
 
+        The state contains ln F, and the contact contains F. The standard deviation of F is F times that of ln F, and
+        the correlations are the same.
+
         Args:
             dt_s: The time, s.
             misfit: Distance of the measured charges from the charges of the contact, in standard deviations of the
@@ -133,6 +136,9 @@ class ContactMixture:
     def __init__(self, charges: ChargeSeries, noise: ModelNoise, validity: Validity) -> None:
         """Start without a contact.
 
+        The frames of a few milliseconds form one step. Each step updates Gaussian components, which together are the
+        probability distribution of the contact. Components that describe the same contact form one hypothesis.
+
         Args:
             charges: Charges of every contact on the film.
             noise: Noise of the charges of a frame.
@@ -141,17 +147,19 @@ class ContactMixture:
         self._charges = charges
         self._noise = noise
         self._validity = validity
-        self.time_s = -math.inf
-        self._misfit = math.nan  # misfit of the most probable component
-        self.other: OtherContact | None = None
+        self.time_s = -math.inf  # mean time of the frames of the latest step
+        self._misfit = math.nan  # misfit of the most probable component in this step
+        self.other: OtherContact | None = None  # second contact that may explain the charges of the latest frame
         self._components: Components | None = None  # None if no contact explains the charges
         self._hypotheses: list[ContactHypothesis] = []  # contacts after the latest update, the most probable one first
         self._frames: list[tuple[Array, float]] = []  # charges and time of each frame since the latest update
-        self._step_begin_s = -math.inf  # time of the frame after which the latest update was made
+        self._previous_step_end_s = -math.inf  # time of the frame after which the latest update was made
         self._next_search_s = -math.inf  # earliest time of the next search over the whole film
 
     def step(self, frame: Frame, t_s: float) -> TrackedContact | None:
         """Process the next frame, and replace its contact by the most probable contact.
+
+        If this contact is uncertain, the second most probable contact is stored in the attribute `other`.
 
         Args:
             frame: Frame with a contact. A frame with saturated charges is ignored.
@@ -166,14 +174,16 @@ class ContactMixture:
         if not hypotheses:
             return None
         best, *others = hypotheses
+        # The hypotheses belong to the mean time of the frames of the latest step, which is earlier than this frame.
         delay_s = t_s - self.time_s
         contact = best.contact_after(delay_s, self._misfit)
         frame.set_contact(contact, self._validity)
         self.other = None
         if best.probability < CERTAIN_PROBABILITY:
-            second_best = others[0]
+            second_best = others[0]  # exists, because the sum of all probabilities is 1
             self.other = OtherContact(*second_best.values_after(delay_s), second_best.probability)
         vx_mm_s, vy_mm_s = best.mean[VELOCITY].tolist()
+        # The first six fields are x, y and F, and their standard deviations.
         return TrackedContact(*contact[:6], vx_mm_s, vy_mm_s, best.moving_probability)
 
     def update(self, charge_pC: Array, t_s: float) -> list[ContactHypothesis]:
@@ -195,30 +205,30 @@ class ContactMixture:
         # After a gap in the stream, the frames of a step that was not complete may belong to another contact.
         self._frames = [(charge, time) for charge, time in self._frames if t_s - time < 2.0 * NOISE_INTERVAL_s]
         self._frames.append((charge_pC, t_s))
-        if t_s - self._step_begin_s < NOISE_INTERVAL_s:
+        if t_s - self._previous_step_end_s < NOISE_INTERVAL_s:
             return self._hypotheses
 
         # The frame noise of the n frames is independent, so its variance is divided by n. The slow noise is the same in
         # all frames of a step.
         charges, times_s = zip(*self._frames, strict=True)
         mean_pC = np.mean(charges, axis=0)
-        time_s = float(np.mean(times_s))
+        mean_time_s = float(np.mean(times_s))
         variance_pC2 = self._noise.variance(mean_pC) / len(self._frames) + (SLOW_NOISE_STD * mean_pC) ** 2
-        dt_s = time_s - self.time_s
+        dt_s = mean_time_s - self.time_s  # since the previous step
         self._frames = []
-        self._step_begin_s = t_s
-        self.time_s = time_s
+        self._previous_step_end_s = t_s
+        self.time_s = mean_time_s
 
         # Follow the contact of the previous step. If there was no contact, or the charges no longer fit it, search the
         # whole film, which needs more iterations. The search takes milliseconds, so it is not repeated in every step if
-        # it finds no contact.
+        # it finds no contact. `_fit_components` sets `_components` and `_hypotheses` only if it finds a contact.
         previous = self._components
         self._components = None
         self._hypotheses = []
         if previous is not None and dt_s < MAX_GAP_s:
-            self._update(predict_components(previous, dt_s), mean_pC, variance_pC2, iterations=3)
+            self._fit_components(predict_components(previous, dt_s), mean_pC, variance_pC2, iterations=3)
         if self._components is None and t_s >= self._next_search_s:
-            self._update(self._initial_components(), mean_pC, variance_pC2, iterations=20)
+            self._fit_components(self._initial_components(), mean_pC, variance_pC2, iterations=20)
             if self._components is None:
                 self._next_search_s = t_s + SEARCH_INTERVAL_s
         return self._hypotheses
@@ -235,7 +245,8 @@ class ContactMixture:
         grid = np.stack(np.meshgrid(coordinates, coordinates), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) <= domain.radius]
 
-        # Standard deviations of x and y, of ln F, of the rates, and of the logarithms of the gains
+        # Standard deviations of x and y, of ln F, of the rates, and of the logarithms of the gains. `domain.scale` and
+        # `domain.centre` are the half width and the centre of the domain in x, y and ln F.
         spacing_mm = coordinates[1] - coordinates[0]
         _, _, log_force_scale = domain.scale
         gain_std = np.full(len(self._charges.electrodes), GAIN_STD)
@@ -249,7 +260,7 @@ class ContactMixture:
         equal_log_weights = np.zeros(len(grid))
         return Components(mean, covariance, equal_log_weights)
 
-    def _update(self, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int) -> None:
+    def _fit_components(self, prior: Components, charge_pC: Array, variance_pC2: Array, iterations: int) -> None:
         """Update components with charges, and store the result if a component explains the charges.
 
         The result consists of the components (`_components`), the contacts that they represent (`_hypotheses`), and the
@@ -269,21 +280,23 @@ class ContactMixture:
         is_outside = distance_mm > MAX_RELATIVE_RADIUS * self._charges.domain.radius
         components.log_weight[is_outside] = -np.inf
         best = components.log_weight.argmax()
+        # `SQUARED_GATE` is the squared distance above which a component does not explain the charges.
         if is_outside[best] or updated.squared_distance[best] > SQUARED_GATE:  # no component explains the charges
             return
         self._misfit = math.sqrt(updated.squared_misfit[best])
         components = prune_components(components)  # the most probable component is now the first one
 
         # Search for folds between the components. Also search for folds between the most probable component and two
-        # distant states. These states lie on its longest axis, at the distance `CLEAR_DISTANCE` on either side.
+        # distant states, the ends of its longest axis. They lie at the distance `CLEAR_DISTANCE` on either side. If the
+        # component extends across a fold, it must be split, because it describes only the contacts on one side.
         axis = _longest_axis(components.covariance[0])
-        distant_states = components.mean[0] + CLEAR_DISTANCE * np.array([axis, -axis])
-        is_across_fold = self._is_across_fold(np.vstack([distant_states, components.mean]))
-        best_row = 2  # the two distant states have the rows 0 and 1, and all components follow, the most probable first
-        is_between_components = is_across_fold[best_row:, best_row:]
-        is_between_best_and_distant = is_across_fold[best_row, :best_row]
-        self._hypotheses = _hypotheses_of(components, is_between_components)
-        if is_between_best_and_distant.any():  # a Gaussian component describes only the contacts on one side of a fold
+        axis_ends = components.mean[0] + CLEAR_DISTANCE * np.array([axis, -axis])
+        is_across_fold = self._is_across_fold(np.vstack([axis_ends, components.mean]))
+        best_row = 2  # the two ends have the rows 0 and 1, and all components follow, the most probable first
+        has_fold_between_components = is_across_fold[best_row:, best_row:]
+        has_fold_beside_best = is_across_fold[best_row, :best_row]
+        self._hypotheses = _hypotheses_of(components, has_fold_between_components)
+        if has_fold_beside_best.any():
             components = split_first_component(components, axis, SPLIT_DISTANCE)
         self._components = components
 
@@ -345,7 +358,7 @@ def _hypotheses_of(components: Components, is_across_fold: Booleans) -> list[Con
         share = weight[is_same] / group_weight
         mean = share @ group.mean
         deviation = group.mean - mean
-        spread = (share * deviation.T) @ deviation
+        spread = (share * deviation.T) @ deviation  # covariance of the means, weighted by the shares
         covariance = np.tensordot(share, group.covariance, 1) + spread
         probability = group_weight / weight.sum()
         hypotheses.append(ContactHypothesis(mean, covariance, float(probability)))

@@ -82,8 +82,9 @@ class TouchPeak:
     def add_frame(self, contact: Contact, charge_pC: Array, flags: tuple[str, ...] = ()) -> None:
         """Process the next frame of the touch.
 
-        Frames with a flag in `UNUSED_FRAME_FLAGS` are not averaged. A flag that is not harmless makes the whole touch
-        unusable.
+        The first frame is the reference. A frame whose contact is close to that of the reference is averaged with it.
+        Another frame with a larger force becomes the new reference, and the average begins again. Frames with a flag in
+        `UNUSED_FRAME_FLAGS` are not averaged. A flag that is not harmless makes the whole touch unusable.
 
         Args:
             contact: Contact that the model computed for the frame.
@@ -95,7 +96,7 @@ class TouchPeak:
         if UNUSED_FRAME_FLAGS.intersection(flags):
             return
         reference = self._reference_contact
-        if is_close(contact, reference):
+        if is_close(contact, reference):  # false without a reference
             self._averaged_count += 1
             self._charge_sum_pC = self._charge_sum_pC + charge_pC
         elif reference is None or contact.force_N > reference.force_N:
@@ -185,13 +186,13 @@ class _Conversion(NamedTuple):
     """Shift that converts charges of the changed film into charges of the calibrated film.
 
     Attributes:
-        contact: Contact that the model computes from charges before the conversion. The conversion is used for this
-            contact and for contacts near it.
+        uncorrected_contact: Contact that the model computes from charges before the conversion. The conversion is used
+            for this contact and for contacts near it.
         shift_pC: Charges that the conversion adds, shape (n_electrode,), pC.
         covariance: Covariance of x (mm), y (mm) and the force (N) that the errors of the state cause, shape (3, 3).
     """
 
-    contact: Contact
+    uncorrected_contact: Contact
     shift_pC: Array
     covariance: Array
 
@@ -284,22 +285,23 @@ class FilmFollower(Stage):
     def step(self, frame: Frame) -> None:
         """Correct the contact with the estimate from the earlier touches, and update the estimate when a touch ends.
 
-        An invalid frame does not show whether the touch has ended, and therefore does not change the estimate. If the
-        film is lost, every frame with a contact gets the flag `film`.
+        An invalid frame does not show whether the touch has ended, and therefore does not change the estimate. The film
+        is lost if no state of the film explains the latest touches, or if the estimated state is implausible. Then
+        every frame with a contact gets the flag `film`.
         """
         frame.film = self.film
         if frame.contact is not None and frame.charge_pC is not None:
             corrected_contact = self.follow_contact(frame.contact, frame.charge_pC)
             # The corrected contact is a contact on the calibrated film, so the limits of this film apply.
             frame.set_contact(corrected_contact, self._setup.model.validity)
-            all_flags = (*frame.flags, *frame.contact_flags)
+            all_flags = (*frame.flags, *frame.contact_flags)  # some flags exclude the frame, others the whole touch
             self._peak.add_frame(corrected_contact, frame.charge_pC, all_flags)  # averages the strongest frames
             if self.is_lost:
                 frame.flags.append(FILM)
         elif frame.is_valid:  # no contact, so a touch that had begun has ended
             mean_charge_pC = self._peak.mean_charge_pC
-            self.reset()
-            if mean_charge_pC is not None:
+            self.reset()  # the next touch has a new peak
+            if mean_charge_pC is not None:  # None if no touch had begun, or if it cannot be used
                 self._observe_touch(mean_charge_pC, frame.host_s)
 
     def _observe_touch(self, charge_pC: Array, host_s: float) -> None:
@@ -358,7 +360,7 @@ class FilmFollower(Stage):
         if self.is_lost and not was_lost:
             self._start_estimate()  # the film may have changed suddenly, so earlier touches do not help
         elif not self.is_lost:
-            self._apply_estimate()
+            self._update_applied_state()
             self._conversion = None  # the stored conversion belongs to the earlier state
 
         # After a sudden change, the next touches determine the pretension, and not those before the change.
@@ -373,21 +375,22 @@ class FilmFollower(Stage):
         """
         return min(max(self._mean_square, SMALLEST_ERROR_SCALE), 1.0)
 
-    def _apply_estimate(self) -> None:
-        """Compute the state of the film for which contacts are corrected.
+    def _update_applied_state(self) -> None:
+        """Compute the state of the film for which contacts are corrected, and its covariance.
 
         There are two cases: since the calibration, the pretension has changed by an unknown amount t, or it has not
         changed (t = 0). The state is the mean over both cases, weighted by their probabilities.
 
         Before the first touch, the odds of no change are `UNCHANGED_ODDS`. The touches multiply these odds by the
         Savage-Dickey ratio (Dickey 1971). This ratio is the probability density of t = 0 after the touches, divided by
-        the probability density of t = 0 before the first touch.
+        the probability density of t = 0 before the first touch, when the mean of t is 0.
 
-        The covariance is the covariance of the first case and not a mean over both cases, because hardly any film keeps
-        its pretension exactly. The mean state differs from the states of both cases. Therefore, the covariance is
-        increased by the outer product of the difference between these states, times the probability of no change.
+        The covariance is that of the first case and not a mean over both cases, because hardly any film keeps its
+        pretension exactly. Two parts are added. The first part is the outer product of the difference between the
+        states of both cases, times the probability of no change. The second part is the variance of the offset of a
+        single touch about the common offset.
         """
-        change_MPa = self._state[0]
+        change_MPa = self._state[0]  # t in the first case
         variance = self._covariance[0, 0]
         # The density of a normal distribution at t = 0 is exp(-0.5 mean^2 / variance) / std, up to a constant factor.
         std_ratio = self._initial_std[0] / math.sqrt(variance)
@@ -414,7 +417,8 @@ class FilmFollower(Stage):
         Returns:
             The charges, and their derivatives with respect to each contact and with respect to the state.
         """
-        film = self._series.in_state(contacts_of(contacts), state[self._film])  # q and its derivatives
+        # Charges q that the film causes in this state, and their derivatives
+        film = self._series.in_state(contacts_of(contacts), state[self._film])
         gains = np.exp(state[self._gains])
         amplified_pC = gains * film.charge_pC  # g q, shape (n, n_electrode)
         offset_pC = state[self._offset] * self._offset_ratio  # r p, shape (n_electrode,)
@@ -441,26 +445,29 @@ class FilmFollower(Stage):
         the film, the contact is returned unchanged.
 
         Args:
-            contact: Contact that `predictor` computed from the charges.
+            contact: Contact that the model computed from the charges.
             charge_pC: Touch charges, shape (n_electrode,), pC.
         """
         state = self._applied_state
         if state is None:  # there is no estimate yet
             return contact
         conversion = self._conversion
-        if conversion is None or not is_close(contact, conversion.contact):
+        if conversion is None or not is_close(contact, conversion.uncorrected_contact):
             # The conversion to charges of the calibrated film depends on the corrected contact, which is not known yet.
             # A conversion at the given contact yields this contact roughly. The result is used again while the given
-            # contact hardly changes.
+            # contact hardly changes. It is therefore stored with the given contact, with which `is_close` compares.
             rough_conversion = self._conversion_at(contact, state)
-            corrected = self._setup.model.predict(charge_pC + rough_conversion.shift_pC)
-            conversion = self._conversion_at(corrected, state)._replace(contact=contact)
+            rough_contact = self._setup.model.predict(charge_pC + rough_conversion.shift_pC)
+            conversion = self._conversion_at(rough_contact, state)._replace(uncorrected_contact=contact)
             self._conversion = conversion
-        followed = self._setup.model.predict(charge_pC + conversion.shift_pC)
-        return followed.with_error(conversion.covariance)
+        corrected_contact = self._setup.model.predict(charge_pC + conversion.shift_pC)
+        return corrected_contact.with_error(conversion.covariance)
 
     def _conversion_at(self, contact: Contact, state: Array) -> _Conversion:
         """Return the conversion from charges of the changed film to charges of the calibrated film, near a contact.
+
+        The conversion contains a shift of the charges, and the covariance of the contact that errors of the state
+        cause. `_applied_covariance` is the covariance of the state.
 
         Args:
             contact: Contact on the calibrated film.
@@ -468,16 +475,17 @@ class FilmFollower(Stage):
         """
         # Charges of the contact on the changed and on the calibrated film, and the derivatives of the latter charges
         # with respect to the contact (x, y, ln F), shape (n_electrode, 3)
-        log_contact = self._log_contact(contact)
-        changed = self._values(log_contact, state)
-        (calibrated_pC,), (slopes_pC,) = self._series.linearised(contacts_of(log_contact))
-        shift_pC = calibrated_pC - changed.charge_pC[0]
+        log_contact = self._log_contact(contact)  # an array with one row, so the results below have one row each
+        changed_film = self._values(log_contact, state)
+        (calibrated_pC,), (slopes_by_contact_pC,) = self._series.linearised(contacts_of(log_contact))
+        shift_pC = calibrated_pC - changed_film.charge_pC[0]
 
         # An error of the state shifts the contact whose charges are nearest to the converted charges (least squares).
         # The distance of charges is measured in standard deviations of their noise.
         noise_std_pC = np.sqrt(self._setup.model.noise.variance(calibrated_pC))
         weight = 1.0 / noise_std_pC[:, None]
-        contact_by_state = np.linalg.pinv(weight * slopes_pC) @ (weight * changed.by_state[0])  # shape (3, n_state)
-        contact_by_state[2] *= contact.force_N  # from ln F to F
-        covariance = contact_by_state @ self._applied_covariance @ contact_by_state.T
+        # Derivatives of the contact (x, y, ln F) with respect to the state, shape (3, n_state)
+        contact_slopes_by_state = np.linalg.pinv(weight * slopes_by_contact_pC) @ (weight * changed_film.by_state[0])
+        contact_slopes_by_state[2] *= contact.force_N  # dF = F d(ln F)
+        covariance = contact_slopes_by_state @ self._applied_covariance @ contact_slopes_by_state.T
         return _Conversion(contact, shift_pC, covariance)

@@ -98,6 +98,9 @@ def predict_components(components: Components, dt_s: float) -> Components:
             which is the most probable.
         dt_s: Time since the previous step, s.
     """
+    # The slices select entries of a state: VALUES is (x, y, ln F), RATES are their rates, VELOCITY is the rate of x and
+    # y, and MOTION contains VALUES and RATES.
+
     # Add the component as the last one. Its rates are unknown, and independent of its other values: in its covariance,
     # the rows and the columns of the rates are zero except for the variances of the rates.
     present = components.with_copies_of_first(1)
@@ -117,7 +120,7 @@ def predict_components(components: Components, dt_s: float) -> Components:
     covariance = transition @ present.covariance @ transition.T
     squared_speed = (present.mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
     density = ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE  # one for each entry of MOTION
-    log_force_and_rate = [2, 5]  # indices in MOTION
+    log_force_and_rate = [2, 5]  # indices of ln F and of its rate in MOTION
     density[:, log_force_and_rate] = FORCE_ACCELERATION_DENSITY
     covariance[:, MOTION, MOTION] += density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
     return present._replace(mean=mean, covariance=covariance)
@@ -144,8 +147,11 @@ def update_components(
         iterations: Number of iterations.
 
     Returns:
-        The updated components, with their squared misfits and the sums of squared misfit and squared change of state.
+        The updated components, with their squared misfits and their squared distances. A squared distance is the sum of
+        the squared misfit and the squared change of the state.
     """
+    # The slices VALUES and GAINS select (x, y, ln F) and the logarithms of the gains in a state. The last pass of the
+    # loop only evaluates the final states, for the statements after the loop.
     states = prior.mean  # shape (n_component, n_state)
     jacobian = np.zeros((len(states), charge_pC.size, states.shape[1]))  # J
     for iteration in range(iterations + 1):
@@ -168,9 +174,10 @@ def update_components(
         if iteration < iterations:  # move the state, unless this is the last evaluation
             kalman_correction = (cross_covariance.swapaxes(1, 2) @ weighted_innovation)[:, :, 0]  # P J^T S^-1 v
             step = prior.mean + kalman_correction - states
-            # Shorten a step in which x, y or ln F changes by more than its entry of `MAX_ITERATION_STEP`.
-            relative_length = (np.abs(step[:, VALUES]) / MAX_ITERATION_STEP).max(axis=1, keepdims=True)
-            states = states + step / np.maximum(relative_length, 1.0)
+            # Shorten a step in which x, y or ln F changes by more than its entry of `MAX_ITERATION_STEP`, to this
+            # entry.
+            relative_step = (np.abs(step[:, VALUES]) / MAX_ITERATION_STEP).max(axis=1, keepdims=True)
+            states = states + step / np.maximum(relative_step, 1.0)
 
     squared_misfit = (residual_pC**2 / variance_pC2).sum(axis=1)
     # The change of the state, relative to its prior covariance: v^T S^-1 J P J^T S^-1 v
@@ -210,7 +217,7 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
         max_difference = merge_distance * std[row]
         is_similar = (np.abs(motion[kept] - motion[row]) < max_difference).all(axis=1)
         if is_similar.any():
-            most_probable_row = kept[is_similar.argmax()]  # of the similar components
+            most_probable_row = kept[is_similar.argmax()]  # `kept` is in descending order
             log_weight[most_probable_row] = np.logaddexp(log_weight[most_probable_row], log_weight[row])  # sum
         else:
             kept.append(row)
@@ -218,7 +225,7 @@ def prune_components(components: Components, max_count: int = 8, merge_distance:
 
 
 def split_first_component(components: Components, axis: Array, distance: float) -> Components:
-    """Add two narrow components, one at each end of an axis through the first component.
+    """Add two narrow components, one at each end of an axis through the first component, which is kept.
 
     The density of the first component at an end is divided by the maximum of this density. The weight of an added
     component is this ratio times the weight of the first component. The variance of an added component along the axis
@@ -226,7 +233,8 @@ def split_first_component(components: Components, axis: Array, distance: float) 
 
     Args:
         components: The components.
-        axis: Expected change of the state for one standard deviation along the axis, shape (6 + n_electrode,).
+        axis: Direction and length of the axis: the expected change of the state for one standard deviation along it,
+            shape (6 + n_electrode,).
         distance: Distance of the ends from the first component, in standard deviations.
     """
     split = components.with_copies_of_first(2)

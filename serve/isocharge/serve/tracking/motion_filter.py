@@ -155,7 +155,7 @@ class NoiseEstimate:
         expected_square = (1.0 + first_share**2 + last_share**2) * deviation.size
         relative_square = squared_distance / expected_square
 
-        # Update the mean over all frames. A deviation counts as at most three standard deviations.
+        # Update the mean over all frames. A deviation counts as at most three standard deviations of the noise.
         self._frames += 1
         limited_square = min(relative_square, 3.0**2 * self.relative_variance)
         self.relative_variance += (limited_square - self.relative_variance) / self._frames
@@ -173,17 +173,20 @@ class MotionFilter:
     def __init__(self, measured: Array, covariance: Array) -> None:
         """Start with the first frame of a contact.
 
+        The state of a contact consists of x, y and ln F (`VALUES`) and of their rates (`RATES`). In each of four modes,
+        the position is either held or moves, and the force is either held or changes.
+
         Args:
             measured: Measured x, y and ln F, shape (3,), mm, mm and dimensionless.
             covariance: Covariance of the measured values, shape (3, 3).
         """
         # All modes start with the measured values and with unknown rates.
-        self.mean = np.zeros((4, 6))
+        self.mean = np.zeros((4, 6))  # one state for each mode
         self.mean[:, VALUES] = measured
         self.covariance = np.zeros((4, 6, 6))
         self.covariance[:, VALUES, VALUES] = covariance
         self.covariance[:, RATES, RATES] = np.diag(INITIAL_RATE_STD**2)
-        self.probability = np.full(4, 0.25)
+        self.probability = np.full(4, 0.25)  # of each mode
 
     def step(self, dt_s: float, measured: Array, covariance: Array) -> bool:
         """Predict the modes at the next frame, and update the modes and their probabilities with the frame.
@@ -203,14 +206,16 @@ class MotionFilter:
     def _predict(self, dt_s: float) -> None:
         """Replace each mode by its prediction after the time `dt_s`, s. The contact may change its mode in this time.
 
-        First, the states of the previous modes are mixed into one state for each new mode. Then the mixed state is
-        extrapolated by the motion of the new mode.
+        In each of four modes, the position is either held or moves, and the force is either held or changes. A state
+        consists of x, y, ln F and their rates. First, the states of the previous modes are mixed into one state for
+        each new mode. Then the mixed state is extrapolated by the motion of the new mode.
         """
         # Compute the probability of each new mode (row) for each previous mode (column). The position and the force
         # start or stop to change independently of each other, so the probabilities of the two quantities are
-        # multiplied. After a long time, a quantity has changed its mode with the probability 0.5.
-        change = min(dt_s / MEAN_MODE_TIME_s, 0.5)  # probability that one quantity starts or stops to change
-        mode_transition = change**_CHANGE_COUNT * (1.0 - change) ** (2.0 - _CHANGE_COUNT)  # shape (4, 4)
+        # multiplied. `_CHANGE_COUNT` is how many of the two start or stop between two modes, shape (4, 4). After a long
+        # time, a quantity has changed its mode with the probability 0.5.
+        switch_probability = min(dt_s / MEAN_MODE_TIME_s, 0.5)  # that one quantity starts or stops to change
+        mode_transition = switch_probability**_CHANGE_COUNT * (1.0 - switch_probability) ** (2.0 - _CHANGE_COUNT)
 
         # Mix the states of the previous modes for each new mode.
         joint_probability = mode_transition * self.probability
@@ -224,20 +229,24 @@ class MotionFilter:
         mixed_covariance = np.einsum("nm,mij->nij", weights, self.covariance) + spread
 
         # Compute the covariance that is added until the next frame: by the accelerations of moving values, by the
-        # unknown rates of held values, and by the drift of held values.
+        # unknown rates of held values, and by the drift of held values. `_IS_MOVING` is 1 for values and rates that
+        # change in a mode. `UNIT_NOISE` and `TIME_EXPONENT` describe how accelerations add up over time.
         squared_speed = (mean[:, VELOCITY] ** 2).sum(axis=1, keepdims=True)
         density = _IS_MOVING * (ACCELERATION_DENSITY + squared_speed * SPEED_CHANGE_RATE)
         noise = density[:, None] * UNIT_NOISE * dt_s**TIME_EXPONENT
         noise += _HELD_RATE_COVARIANCE + dt_s * HELD_DRIFT_DENSITY
 
         # Predict the states. A value changes by its rate times the time. The rate of a held value has no effect, and is
-        # replaced by the rate of a movement that begins now: zero on average.
+        # replaced by the rate of a movement that begins now: zero on average. `_INTEGRATION` adds the rates to the
+        # values, and `_PREDICTION_FACTOR` is 0 for the rates of held values.
         transition = (_IDENTITY + dt_s * _INTEGRATION) * _PREDICTION_FACTOR  # shape (4, 6, 6)
         self.mean = (transition @ mean[:, :, None])[:, :, 0]
         self.covariance = transition @ mixed_covariance @ transition.swapaxes(1, 2) + noise
 
     def _update(self, measured: Array, covariance: Array) -> bool:
         """Update the predicted modes and their probabilities with measured values.
+
+        Each of the four modes has a mean state and its covariance. `VALUES` is the slice of x, y and ln F in a state.
 
         Args:
             measured: Measured x, y and ln F, shape (3,).
@@ -249,20 +258,22 @@ class MotionFilter:
         """
         # Compute the Mahalanobis distance of the measured values from the prediction of each mode.
         innovation = (measured - self.mean[:, VALUES])[:, :, None]  # shape (4, 3, 1)
-        precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)  # shape (4, 3, 3)
+        # The precision is the inverse of the covariance of the innovation, shape (4, 3, 3).
+        precision = np.linalg.inv(self.covariance[:, VALUES, VALUES] + covariance)
         squared_distance = (innovation * (precision @ innovation)).sum(axis=(1, 2))
-        smallest = squared_distance.min()
+        nearest_squared_distance = squared_distance.min()
         determinant = np.linalg.det(precision)
-        if not (0.0 <= smallest <= SQUARED_GATE and determinant.min() > 0.0):
+        if not (0.0 <= nearest_squared_distance <= SQUARED_GATE and determinant.min() > 0.0):
             return False
 
         # Apply Bayes' rule to the modes. A common factor of the likelihoods has no effect; it makes the exponents <= 0.
-        likelihood = np.exp(0.5 * (smallest - squared_distance)) * np.sqrt(determinant)
+        likelihood = np.exp(0.5 * (nearest_squared_distance - squared_distance)) * np.sqrt(determinant)
         posterior = self.probability * likelihood
         self.probability = np.maximum(posterior / posterior.sum(), np.finfo(float).tiny)
 
-        # Apply the Kalman update to each mode. Without rounding errors, the last statement would add zero. It turns the
-        # short form of the updated covariance into the form of Joseph, whose variances do not become negative.
+        # Apply the Kalman update to each mode. Without rounding errors, the last statement would add zero, because
+        # gain @ covariance would equal the covariance of the state with the values after the line before. Both
+        # statements together are the form of Joseph, whose variances do not become negative by rounding.
         gain = self.covariance[:, :, VALUES] @ precision
         self.mean += (gain @ innovation)[:, :, 0]
         self.covariance -= gain @ self.covariance[:, VALUES]
@@ -292,12 +303,12 @@ class ContactFilter:
         """Start without a frame.
 
         Args:
-            constant_variance_share: Variance of the errors that are the same in every frame of a held contact, divided
-                by the variance that the model states, 0 to 1.
+            constant_variance_share: Variance of the errors that are the same in every frame while the contact does not
+                change, divided by the variance that the model states, 0 to 1.
         """
-        self.time_s = -math.inf
+        self.time_s = -math.inf  # time of the latest frame
         self._constant_share = constant_variance_share
-        self._motion: MotionFilter | None = None
+        self._motion: MotionFilter | None = None  # None before the first contact
         self._noise = NoiseEstimate()
         self._is_outlier = False  # whether the latest frame was ignored
 

@@ -54,7 +54,8 @@ class TouchEvents:
         contact moves or rests, no event begins.
 
         Args:
-            tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves.
+            tracked: Tracked contact of the frame. Its attribute `moving` is the probability that the contact moves, not
+                a truth value.
             t_s: Time of the frame, s.
         """
         position = complex(tracked.x_mm, tracked.y_mm)
@@ -118,12 +119,15 @@ class Tracker(Stage):
         Raises:
             ModelError: If the file `charges.npz` of the model is damaged.
         """
-        # By default, each touch gets a filter of the predicted contacts. `lasting` is a ratio of standard deviations.
+        # By default, each touch gets a filter of the predicted contacts. `lasting` is the standard deviation of the
+        # errors that remain the same while a contact is held, divided by that of all errors. `_new_filter` is a
+        # function that creates a filter.
         rule = setup.device.rule(TrackRule) or TrackRule()
         constant_variance_share = rule.lasting**2
         self._new_filter: Callable[[], ContactFilter | ContactMixture] = partial(ContactFilter, constant_variance_share)
 
-        # If the film is not followed, and different contacts have the same charges, each touch gets a mixture instead.
+        # If the film is not followed, and different contacts have the same charges (`is_folded`), each touch gets a
+        # mixture instead. `FollowRule` is the section of the device file with which the film is followed.
         predictor = setup.predictor
         if predictor is not None and setup.device.rule(FollowRule) is None:
             charges = read_charge_map(predictor.folder, predictor.metadata.electrodes)  # None without the file
@@ -132,7 +136,8 @@ class Tracker(Stage):
                 # describes the charges, and not only in the working area of the model.
                 validity = replace(predictor.validity, corners_mm=disk_corners(charges.domain.radius))
                 self._new_filter = lambda: ContactMixture(charges, setup.model.noise, validity)
-        self._time_s = 0.0  # time of the latest valid frame on a clock that is never set back
+        # Time of the latest valid frame, which is the sum of the time steps and therefore never set back
+        self._time_s = 0.0
         self._events: TouchEvents | None = None  # None without a touch
         self.reset()
 
@@ -152,7 +157,7 @@ class Tracker(Stage):
 
         The previous tracked contact is used again if the frame is invalid, or if the filter returns no contact. If more
         than `MAX_GAP_s` have passed without a contact, a new filter begins. If the clock was set back, the touch
-        continues, because the time between the two frames counts as 0.
+        continues, because `dt_s` is then 0.
         """
         if frame.is_valid:
             self._time_s += frame.dt_s
@@ -168,7 +173,7 @@ class Tracker(Stage):
                     frame.event = "press"
                 else:
                     frame.event = self._events.step(tracked, self._time_s)
-        elif frame.is_valid:  # the touch, if there was one, has ended; an invalid frame does not show this
+        elif frame.is_valid:  # nothing touches the film, so a touch that had begun has ended
             if self._events is not None:
                 frame.event = self._events.end(self._time_s)
                 self._events = None
