@@ -84,7 +84,8 @@ class Prediction(Stage):
     def __init__(self, setup: Setup) -> None:
         """Create the predictor for the noise of the board, and store the predictor in the setup for the later stages.
 
-        A contact is valid within the working area and the forces of this predictor.
+        A contact is valid within the working area and the forces of this predictor. `setup.model` returns the predictor
+        that is stored in the setup.
         """
         self._setup = setup
         self._predictor = predictor_for(setup.device, setup.model)
@@ -99,17 +100,21 @@ class Prediction(Stage):
         """
         if frame.charge_pC is None or not frame.is_contact:
             return
-        if frame.noise_pC is not self._noise_pC:  # the film was tared, or the board sends currents
+        # An array is never changed in place. Another array is therefore another noise: the film was tared, or the board
+        # sends currents.
+        if frame.noise_pC is not self._noise_pC:
             self._noise_pC = frame.noise_pC
             self._setup.predictor = self._predictor.for_measured_noise(frame.noise_pC)
-        predictor = self._setup.model
+        predictor = self._setup.model  # the predictor that is stored in the setup
         frame.contact, frame.contact_flags = predictor.predict_with_flags(frame.charge_pC)
         if frame.warming_error_pC is not None:
-            # The contact changes by half of the difference between the contacts of raised and of lowered charges.
-            changed_pC = frame.charge_pC + np.outer([1.0, -1.0], frame.warming_error_pC)
+            # An error of the warming changes the contact by half of the difference between the contacts of raised and
+            # of lowered charges.
+            changed_pC = frame.charge_pC + np.outer([1.0, -1.0], frame.warming_error_pC)  # shape (2, n_electrode)
+            # `np.asarray` gives one row for each contact, which begins with x, y and the force.
             raised, lowered = np.asarray(predictor.predict_batch(changed_pC), float)[:, :3]
-            change = 0.5 * (raised - lowered)  # of x, y and the force
-            frame.contact = frame.contact.with_error(np.outer(change, change))
+            contact_error = 0.5 * (raised - lowered)
+            frame.contact = frame.contact.with_error(np.outer(contact_error, contact_error))
 
 
 STAGES: tuple[type[Stage], ...] = (
@@ -170,8 +175,9 @@ def load_device(path: StrPath | None) -> Device:
 def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     """Convert the content of a device file to the settings of a board.
 
-    If the section `[frames]` has no key `format`, the format of the frames is `auto`. If a section contains the key
-    `on = false`, the stage of the section is switched off, and the result has no settings for it.
+    If the section `[frames]` has no key `format`, the format of the frames is `auto`. Every section with the settings
+    of a stage becomes an object of a subclass of `Rule`. If such a section contains the key `on = false`, the stage is
+    switched off, and the result has no settings for it.
 
     Args:
         table: Sections and keys of the file, as the docstring of this module describes them.
@@ -185,10 +191,19 @@ def device_from_table(table: Mapping[str, Any], where: str) -> Device:
     if isinstance(frames, Mapping):  # `convert` adds a missing section, and reports an error if it is not a mapping
         complete_table["frames"] = {"format": "auto", **frames}
     sections: Any = convert(complete_table, DeviceSections, where, DeviceError)
-    # The other sections contain the settings (rules) of the stages. Each stage finds its settings by their class.
+    # Besides the name, the front end, the frames and the channels, each section has the settings of one stage. Each
+    # stage finds its settings by their class.
     values = structs.asdict(sections).values()
-    rules = {type(value): value for value in values if isinstance(value, Rule) and value.on}
-    return Device(sections.name, sections.front_end, sections.frames, sections.channels, rules, table, where)
+    settings_by_class = {type(value): value for value in values if isinstance(value, Rule) and value.on}
+    return Device(
+        name=sections.name,
+        front_end=sections.front_end,
+        frames=sections.frames,
+        channels=sections.channels,
+        rules=settings_by_class,
+        table=table,
+        where=where,
+    )
 
 
 ANY_BOARD = device_from_table({}, "device")

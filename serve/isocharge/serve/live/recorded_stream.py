@@ -43,6 +43,7 @@ class RecordedStream:
         self._stream = stream
         self.recorder: Recorder | None = None
         self._opened_recorder = ExitStack()  # closes the present recorder
+        # Functions that carry out the requests. They are called before the next chunk is processed.
         self._requests: deque[Callable[[], None]] = deque()
         self._preamble = b""  # chunks up to the one with the first frame, which show the layout of the frames
         self._loader = ThreadPoolExecutor(1, "model")  # loads one model at a time
@@ -92,8 +93,8 @@ class RecordedStream:
         Requests are executed before each chunk. A chunk is recorded before its records are computed, and each record
         before it is yielded. When the caller closes the generator, the recording ends, too.
 
-        The bytes up to the first frame (`_preamble`) are stored, because they show the layout of the frames. A
-        recording that was requested during the stream begins with these bytes.
+        The bytes up to the first frame (`_preamble`) are stored, because they show the layout of the frames. If a
+        recording begins while the stream is running, these bytes are processed again and recorded first.
 
         Args:
             chunks: Chunks of bytes from a port or from a file.
@@ -111,7 +112,7 @@ class RecordedStream:
                     execute_request = self._requests.popleft()
                     execute_request()
                 recorder = self.recorder
-                if recorder is not None and recorder is not previous_recorder:
+                if recorder is not None and recorder is not previous_recorder:  # a request began a recording
                     chunk = self._begin_again(recorder, chunk)
                 if self._stream.parser.counts.frames == 0:
                     self._preamble += chunk.data
@@ -138,26 +139,30 @@ class RecordedStream:
 
         The records of the new recording then depend only on the bytes in this recording. The first chunk of the
         recording contains the first bytes of the stream, from which a replay learns the layout of the frames. This
-        chunk is written without records.
+        chunk is written without records. The counters of the stream continue, as if it had not been restarted.
+
+        Frames that have arrived between the first bytes and the next chunk are missing in the recording. The next chunk
+        therefore states an outage, so that the tare and the clock begin again.
 
         Args:
             recorder: Recorder of the new recording.
             chunk: The next chunk of the stream.
 
         Returns:
-            The next chunk. Frames that have arrived between the first bytes and this chunk are missing in the
-            recording. The chunk therefore states an outage, so that the tare and the clock begin again.
+            The next chunk, with an outage if any bytes were processed before.
         """
         if not self._preamble:  # no bytes have been processed yet
             return chunk
-        counts = self._stream.parser.counts
-        self._stream.restart()
+        counts_so_far = self._stream.parser.counts
+        self._stream.restart()  # begins new counters
         preamble = chunk._replace(data=self._preamble, outage_s=0.0)
-        deque(self._stream.feed(preamble), maxlen=0)  # processes the chunk, and discards the records
+        for _ in self._stream.feed(preamble):  # each step processes a frame, and its record is discarded
+            pass
         recorder.event(chunk=preamble)
-        self._stream.parser.counts = counts  # continue to count, also the losses before the recording
-        self._stream.dropped_at_frame = counts.bytes_dropped
-        counts.reconnects -= 1  # the outage that the next chunk states is none of the port
+        self._stream.parser.counts = counts_so_far  # continue to count, also the losses before the recording
+        self._stream.dropped_at_frame = counts_so_far.bytes_dropped
+        # The stream will count the outage of the next chunk as a reconnection, although the port was not lost.
+        counts_so_far.reconnects -= 1
         return chunk._replace(outage_s=max(chunk.outage_s, 1e-6))  # any outage above 0 has the same effect
 
     def _record_event(self, **event: bool | str | Marker) -> None:
@@ -191,7 +196,7 @@ class RecordedStream:
             )
             return
         new_label = new_predictor.metadata.label
-        self._record_event(use=new_label)
+        self._record_event(use=new_label)  # a replay uses the same model from here on
         log.warning("%s serves from now on, after %s", new_label, present_label)
 
     def _tare(self) -> None:
@@ -232,34 +237,41 @@ def replay(
     """
     previous_chunk: Chunk | None = None
     due_s = 0.0  # monotonic time at which the replay of the latest chunk begins
-    records: Iterator[PredictionRecord] = iter(())  # records of the previous chunk that were not yielded yet
+    # Records of the latest chunk that were not yielded yet. The stream computes each record when it is taken from the
+    # iterator.
+    pending_records: Iterator[PredictionRecord] = iter(())
     for event in recording.events():
         if event.latency_us is not None:  # the line is a record, which the recorded stream has yielded
-            record = next(records, None)
-            if record is not None:
+            record = next(pending_records, None)
+            if record is not None:  # None if all records were yielded at once
                 yield structs.replace(record, latency_us=event.latency_us)
             continue
 
         # The line is no record, so that all recorded records of the previous chunk were yielded. If the recording
         # program ended within that chunk, its last records are missing in the recording. The stream processes the whole
-        # chunk all the same, but `deque` discards the remaining records.
-        deque(records, maxlen=0)
+        # chunk all the same, but the remaining records are discarded.
+        for _ in pending_records:
+            pass
         chunk = event.chunk
         if event.marker is not None:
             on_marker(event.marker)
-        elif event.use is not None:
+        elif event.use is not None:  # label of the model that the recorded stream used from here on
             if load is not None:
                 stream.use(load(event.use))
         elif event.tare:
             stream.tare()
         elif chunk is not None:
             # The first chunk is due at once. The time between two chunks is the same as between their arrivals.
-            due_s = due_s + elapsed_s(previous_chunk, chunk) if previous_chunk else time.monotonic()
+            if previous_chunk:
+                due_s += elapsed_s(previous_chunk, chunk)
+            else:
+                due_s = time.monotonic()
             previous_chunk = chunk
             if real_time:
                 wait_s = max(0.0, due_s - time.monotonic())
                 time.sleep(min(wait_s, threading.TIMEOUT_MAX))
-            records = stream.feed(chunk)
+            pending_records = stream.feed(chunk)
             if yields_all:
-                yield from records
-    deque(records, maxlen=0)
+                yield from pending_records
+    for _ in pending_records:  # process the rest of the last chunk
+        pass

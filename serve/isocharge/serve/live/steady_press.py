@@ -148,15 +148,16 @@ class PressWatch:
         Args:
             begin_s: Time of the first frame of the press, s.
         """
-        self._begin_s = begin_s
-        self._end_s = begin_s  # time of the latest frame of the press
+        self._press_begin_s = begin_s
+        self._press_end_s = begin_s  # time of the latest frame of the press
+        # Until now, `_frames` contains the latest frames without touch. From now on, it contains the window.
         rest_charges_pC = [frame.charge_pC for frame in self._frames if frame.clock_s <= begin_s - self.EDGE_S]
         self._rest_pC: Array | None = None  # mean charges just before the touch; None without enough frames
         if len(rest_charges_pC) >= self.MIN_REST_FRAMES:
             self._rest_pC = np.array(rest_charges_pC).mean(axis=0)
         self._frames.clear()
         self._last_check_s = begin_s  # time at which the window was last examined
-        self._reason = ""  # why the press is not steady yet; empty before the first examined window
+        self._unsteady_reason = ""  # why the press is not steady yet; empty before the first examined window
         self._min_scatter_pC = math.inf  # smallest scatter of all windows
 
     def arm(self) -> None:
@@ -194,7 +195,7 @@ class PressWatch:
                 self._phase = Phase.taring
             return WatchResult(self._phase)
         if not frame.is_contact:
-            return self._process_rest(frame)
+            return self._process_rest(frame)  # also ends the phases `settling` and `lift`
         if self._phase is Phase.lift:  # the press of this touch was accepted or refused before
             return WatchResult(Phase.lift)
         if self._phase is not Phase.settling:  # the touch begins with this frame
@@ -209,28 +210,28 @@ class PressWatch:
         """Add the next frame to the window, and accept or refuse the press if this can be decided.
 
         The press is accepted if it is steady. The press is refused if an amplifier is saturated, if the film was not at
-        rest before the press, or if the press is not steady within `MAX_HELD_S`.
+        rest before the press, or if the press is not steady within `MAX_HELD_S`. Until then, the phase is `settling`.
         """
-        self._end_s = frame.clock_s
-        held_s = self._end_s - self._begin_s
+        self._press_end_s = frame.clock_s
+        held_s = self._press_end_s - self._press_begin_s
         if SATURATED in frame.flags:
             return WatchResult(Phase.refused, "an amplifier is at its limit: press less hard")
-        if self._rest_pC is None:
-            if held_s < self.MIN_HELD_S:
+        if self._rest_pC is None:  # the film was not at rest before
+            if held_s < self.MIN_HELD_S:  # the touch may end so soon that it is ignored
                 return WatchResult(Phase.settling)
             return WatchResult(Phase.refused, NO_REST_BEFORE_PRESS)
         self._store(frame, self.WINDOW_S, self.MIN_FRAMES)
 
         is_window_full = held_s >= self.WINDOW_S and len(self._frames) >= self.MIN_FRAMES
-        if is_window_full and self._end_s - self._last_check_s >= self.CHECK_INTERVAL_S:
-            self._last_check_s = self._end_s
-            press = self._examine_window(self._rest_pC, frame.noise_pC)
+        if is_window_full and self._press_end_s - self._last_check_s >= self.CHECK_INTERVAL_S:
+            self._last_check_s = self._press_end_s
+            press = self._examine_window(self._rest_pC, frame.noise_pC)  # None if unsteady; sets `_unsteady_reason`
             if press is not None:
                 return WatchResult(Phase.taken, press=press)
         if held_s > self.MAX_HELD_S:
-            reason = self._reason or "too few frames come"
+            reason = self._unsteady_reason or "too few frames come"
             return WatchResult(Phase.refused, f"not steady within {self.MAX_HELD_S:g} s: {reason}")
-        return WatchResult(Phase.settling, self._reason)
+        return WatchResult(Phase.settling, self._unsteady_reason)
 
     def _examine_window(self, rest_pC: Array, noise_pC: Array) -> SteadyPress | None:
         """Return the press in the window if the press is steady. Otherwise, return None and store the reason.
@@ -251,17 +252,18 @@ class PressWatch:
 
         # The line is fitted by least squares. Its value at the mean time of the frames is the mean charge.
         centred_s = times_s - times_s.mean()
-        square_sum_s2 = max(centred_s @ centred_s, 1e-30)  # not 0, by which the next line divides, for equal times
+        square_sum_s2 = max(centred_s @ centred_s, 1e-30)  # avoids a division by 0 if all times are equal
         slope_pC_per_s = centred_s @ charge_pC / square_sum_s2
         mean_pC = charge_pC.mean(axis=0)
         scatter_pC = (charge_pC - mean_pC - np.outer(centred_s, slope_pC_per_s)).std(axis=0)
         drift_pC = np.abs(slope_pC_per_s) * (times_s[-1] - times_s[0])
 
         # Divide the drift by its limit. A charge that is smaller than the mean magnitude may change as much as a charge
-        # of the mean magnitude. Because of the scatter, the change of a line through n values has the standard
-        # deviation sqrt(12 / n) times that of one value.
+        # of the mean magnitude.
         magnitude_pC = np.abs(mean_pC)
         reference_pC = np.maximum(magnitude_pC, magnitude_pC.mean())
+        # Because of the scatter, the change of a line through n values has the standard deviation sqrt(12 / n) times
+        # that of one value.
         drift_std_pC = scatter_pC * math.sqrt(12.0 / len(times_s))
         max_drift_pC = self.MAX_RELATIVE_DRIFT * reference_pC + self.DRIFT_SIGMAS * drift_std_pC
         relative_drift = drift_pC / max_drift_pC
@@ -272,24 +274,24 @@ class PressWatch:
         relative_scatter = scatter_pC / max_scatter_pC
 
         # If a charge exceeds a limit, state the reason why the press is not steady. Otherwise, return the press.
-        scattering = relative_scatter.argmax()  # index of the charge with the largest relative scatter
-        drifting = relative_drift.argmax()  # index of the charge with the largest relative drift
-        if relative_scatter[scattering] > 1.0:
-            reason = f"the charge of {self._electrodes[scattering]} shakes by {scatter_pC[scattering]:.2g} pC"
-        elif relative_drift[drifting] > 1.0:
+        worst_scatter = relative_scatter.argmax()  # index of the electrode with the largest relative scatter
+        worst_drift = relative_drift.argmax()  # index of the electrode with the largest relative drift
+        if relative_scatter[worst_scatter] > 1.0:
+            reason = f"the charge of {self._electrodes[worst_scatter]} shakes by {scatter_pC[worst_scatter]:.2g} pC"
+        elif relative_drift[worst_drift] > 1.0:
             reason = (
-                f"the charge of {self._electrodes[drifting]} changes by {slope_pC_per_s[drifting]:.2g} pC per second "
-                f"from {mean_pC[drifting]:.3g} pC: hold place and force still; if it also changes under a weight, "
-                "measure the leak of the amplifiers with isocharge serve doctor"
+                f"the charge of {self._electrodes[worst_drift]} changes by {slope_pC_per_s[worst_drift]:.2g} pC per "
+                f"second from {mean_pC[worst_drift]:.3g} pC: hold place and force still; if it also changes under a "
+                "weight, measure the leak of the amplifiers with isocharge serve doctor"
             )
         else:
             flags = flags_in_order(flag for frame in self._frames for flag in frame.flags)
-            return SteadyPress(mean_pC, self._end_s - self._begin_s, flags)
+            return SteadyPress(mean_pC, self._press_end_s - self._press_begin_s, flags)
 
         # Store the reason, but keep the reason from an earlier window with a smaller scatter.
         if scatter_pC.max() <= self._min_scatter_pC:
             self._min_scatter_pC = scatter_pC.max()
-            self._reason = reason
+            self._unsteady_reason = reason
         return None
 
     def _store(self, frame: Frame, duration_s: float, min_count: int = 1) -> None:
@@ -301,7 +303,8 @@ class PressWatch:
     def _process_rest(self, frame: Frame) -> WatchResult:
         """Store a frame in which nothing touches the film, and refuse a press that has ended without becoming steady.
 
-        Frames within `EDGE_S` after a press are not stored. A touch shorter than `MIN_HELD_S` is ignored.
+        Frames within `EDGE_S` after a press are not stored. A touch shorter than `MIN_HELD_S` is ignored. In each case,
+        the watch then waits for the next press. Only the result for this frame states that a press was refused.
 
         Args:
             frame: The frame.
@@ -310,11 +313,11 @@ class PressWatch:
         if self._phase is not Phase.waiting:
             self._frames.clear()  # frames of a press
         self._phase = Phase.waiting
-        if frame.clock_s > self._end_s + self.EDGE_S:
-            self._store(frame, self.EDGE_S + self.REST_S)
+        if frame.clock_s > self._press_end_s + self.EDGE_S:
+            self._store(frame, self.EDGE_S + self.REST_S)  # and discard frames that are older than this time
 
-        held_s = self._end_s - self._begin_s
+        held_s = self._press_end_s - self._press_begin_s
         if is_press_unfinished and held_s >= self.MIN_HELD_S:
-            reason = self._reason or "hold it longer"
+            reason = self._unsteady_reason or "hold it longer"
             return WatchResult(Phase.refused, f"released after {held_s:.1f} s, before it was steady: {reason}")
         return WatchResult(Phase.waiting)

@@ -84,14 +84,14 @@ class ReadingStream:
     def restart(self) -> None:
         """Return to the state of a new stream, so that all later results depend only on later bytes.
 
-        The parser, which also counts the frames, the clock and the stages are created anew.
+        The parser with its counters of frames, the clock and the stages are created anew.
         """
         self.parser = self._device.parser()
         self.clock = DeviceClock()
         self._stages = create_stages(self._setup)
         self._pending_flags: list[str] = []  # flags that the next frame gets
         self._previous_values: tuple[float, ...] = ()
-        self.dropped_at_frame = 0.0
+        self.dropped_at_frame = 0.0  # number of dropped bytes at the latest frame
 
     def tare(self) -> None:
         """Discard the tare and the present touch, and measure the tare again from the next quiet frames."""
@@ -114,13 +114,14 @@ class ReadingStream:
     def _received_frames(self, chunk: Chunk) -> list[Frame]:
         """Return the frames whose last byte is in a chunk, with their times and the flags from their sequence numbers.
 
-        If the chunk follows an outage of the port, the state before the outage is discarded first.
+        If the chunk follows an outage of the port, the state before the outage is discarded first. The next frame also
+        gets `_pending_flags`, such as the flag of such an outage.
 
         Raises:
             NoFramesError: If the stream has contained no intact frame in many bytes.
         """
         if chunk.outage_s > 0.0:
-            self._reconnect()
+            self._reconnect()  # the port is open again; discards the state
         frames = self.parser.feed(chunk.data)
         if not frames:
             self._check_recognised()
@@ -133,6 +134,7 @@ class ReadingStream:
             # The number of intervals since the previous frame is 1 plus the number of lost frames between them. The
             # number is 0 for a late frame, because this frame was counted as lost before, and for a repeated frame.
             lost_before = parser.counts.lost
+            # The next call compares the sequence number with that of the previous frame, and counts the lost frames.
             sequence_flags = parser.sequence_flags(frame.seq, is_clock_reset=frame.is_clock_reset)
             frame.intervals = 1 + parser.counts.lost - lost_before
             if REPEAT in sequence_flags and frame.values == self._previous_values:
@@ -155,7 +157,7 @@ class ReadingStream:
         """Raise an error if more than `max_bytes` bytes have arrived without an intact frame.
 
         The bytes are counted from the latest frame. After the first frame, a warning is logged instead of the error,
-        because a disturbance may end.
+        because a disturbance may end. No second warning follows until the next frame.
 
         Raises:
             NoFramesError: If the stream has contained no frame.
@@ -166,7 +168,7 @@ class ReadingStream:
             return
         line = f", such as {shown(self.parser.unread_line)}" if self.parser.unread_line else ""
         if counts.frames:
-            self.dropped_at_frame = math.inf
+            self.dropped_at_frame = math.inf  # so that no further warning follows before the next frame sets it
             log.warning(
                 "no intact frame among the latest %d bytes%s; expected %s, as before: check the cable, and start again "
                 "if the board sends other frames now",
@@ -182,7 +184,7 @@ class ReadingStream:
         )
 
     def _reconnect(self) -> None:
-        """Discard the state of the parser, the clock and the tare after an outage of the port.
+        """Discard the state of the parser, the clock and the tare after an outage of the port, which has reconnected.
 
         The state before the outage is no longer valid, because frames are missing and the film may have been touched
         during the outage. The next frame gets the flag `reconnected`.
@@ -226,7 +228,7 @@ class TouchStream(ReadingStream):
                 cannot be estimated with the model.
         """
         self.predictor = predictor
-        self._given_name = frame_id
+        self._given_frame_id = frame_id
         super().__init__(predictor.metadata.electrodes, device, predictor=predictor)
 
     def restart(self) -> None:
@@ -241,18 +243,19 @@ class TouchStream(ReadingStream):
             ModelError: If a stage cannot use the model. The present stages and their model then remain in use.
         """
         # The contact stages are created with a copy of the setup. If a stage raises an error, the present setup is
-        # unchanged. The first stage stores in the copy the model with the noise of the board, which then replaces the
-        # present model for all stages.
+        # unchanged.
         new_setup = replace(self._setup)
         new_setup.use(predictor)
         contact_stages = create_stages(new_setup, needs_contact=True)
+        # The first contact stage has replaced the model in the copy by a model with the noise of the board. All stages
+        # use this model from now on.
         self._setup.use(new_setup.model)
         charge_stages = [stage for stage in self._stages if not stage.needs_contact]
         self._stages = charge_stages + contact_stages
-        self.sections = tuple(stage.section for stage in contact_stages)
+        self.sections = tuple(stage.section for stage in contact_stages)  # a section may add fields to the records
         self.predictor = predictor
         self._label = predictor.metadata.label
-        self.frame_id = self._given_name or predictor.metadata.frame_id
+        self.frame_id = self._given_frame_id or predictor.metadata.frame_id
 
     def use(self, predictor: Predictor) -> None:
         """Use another model with the same electrodes from the next frame on.
@@ -294,6 +297,7 @@ class TouchStream(ReadingStream):
         if frame.contact is not None:
             contact_fields = frame.contact._asdict()
         else:
+            # If nothing touches the film, the force is 0. For an invalid frame, the force is unknown, too.
             contact_fields = NO_CONTACT if frame.is_valid else UNKNOWN_CONTACT
         electrodes = self._setup.electrodes
         charge_pC, raw_pC, tare_pC = [

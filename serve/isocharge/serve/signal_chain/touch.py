@@ -181,8 +181,7 @@ class Touch(Stage):
         # threshold. A smaller release threshold of a weak touch could be below the noise, so the touch would never end.
         held_size = min(size, self._previous_size)  # a spike of a single frame is not a peak
         self._peak_size = max(self._peak_size, held_size)
-        half_threshold = 0.5
-        release_size = max((rule.release_share or 0.0) * self._peak_size, half_threshold)
+        release_size = max((rule.release_share or 0.0) * self._peak_size, 0.5)
 
         # End the touch if the charges are small, or have changed their sign. If charges may have any sign, they are
         # compared with those of the previous frame. Otherwise, most charges of a touch are positive, as is their sum.
