@@ -294,10 +294,10 @@ class PressWatch:
             self._unsteady_reason = reason
         return None
 
-    def _store(self, frame: Frame, duration_s: float, min_count: int = 1) -> None:
-        """Store a frame, and discard the frames that are older than `duration_s`, except the latest `min_count`."""
+    def _store(self, frame: Frame, kept_s: float, min_count: int = 1) -> None:
+        """Store a frame, and discard the frames that are older than `kept_s`, except the latest `min_count`."""
         self._frames.append(frame)
-        while len(self._frames) > min_count and self._frames[0].clock_s < frame.clock_s - duration_s:
+        while len(self._frames) > min_count and self._frames[0].clock_s < frame.clock_s - kept_s:
             self._frames.popleft()
 
     def _process_rest(self, frame: Frame) -> WatchResult:
@@ -314,7 +314,7 @@ class PressWatch:
             self._frames.clear()  # frames of a press
         self._phase = Phase.waiting
         if frame.clock_s > self._press_end_s + self.EDGE_S:
-            self._store(frame, self.EDGE_S + self.REST_S)  # and discard frames that are older than this time
+            self._store(frame, kept_s=self.EDGE_S + self.REST_S)
 
         held_s = self._press_end_s - self._press_begin_s
         if is_press_unfinished and held_s >= self.MIN_HELD_S:
