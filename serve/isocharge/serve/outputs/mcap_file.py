@@ -68,7 +68,8 @@ class McapFile(FileOutput):
         self._is_ros2 = is_ros2
         self._flush_time_s = time.monotonic()
         self._writer = Writer(self._file)  # type: ignore[arg-type]  # uses only write, tell and flush
-        # Topic, encoding of the messages, name of the schema, notation of the schema, and the schema of each channel
+        # A channel is declared by its topic, the encoding of its messages, the name of its schema, the notation of the
+        # schema, and the schema.
         ros2_records = (RECORD_TOPIC, "cdr", STRING, "ros2msg", DEFINITIONS[STRING])
         json_records = (RECORD_TOPIC, "json", SCHEMA_NAME, "jsonschema", json.dumps(record_schema(electrodes)))
         channels = [
@@ -89,13 +90,14 @@ class McapFile(FileOutput):
             struct.error: If a time stamp of ROS 2 cannot represent the time of the record.
             OSError: If the disk is full or was removed.
         """
-        values = with_tracked_contact(record.json_values)
-        time_ns = ros_time_ns(values)
+        record_values = with_tracked_contact(record.json_values)
+        time_ns = ros_time_ns(record_values)
         json_text = record.to_json()
+        # The message of a wrench is None if the force is unknown, and that of a pose if nothing touches the film.
         messages = {
             RECORD_TOPIC: string_message(json_text) if self._is_ros2 else json_text.encode(),
-            WRENCH_TOPIC: wrench_stamped(values, time_ns),
-            POSE_TOPIC: pose_stamped(values, time_ns),
+            WRENCH_TOPIC: wrench_stamped(record_values, time_ns),
+            POSE_TOPIC: pose_stamped(record_values, time_ns),
         }
         sequence = self.records % (1 << 32)  # the number in the file has 32 bits
         for topic, message in messages.items():

@@ -117,9 +117,9 @@ class WriterQueue(Generic[T]):
         self.lost = 0
         self._write = write
         self._items: SimpleQueue[T | None] = SimpleQueue()  # None ends the thread
-        self._written_count = 0
+        self._written_count = 0  # calls of `write` that have returned
         self._is_abandoned = False  # whether the thread must write no further item
-        self.error: Exception | None = None
+        self.error: Exception | None = None  # exception of `write`, which has ended the thread
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)  # a write may hang forever
         self._thread.start()
 
@@ -142,7 +142,7 @@ class WriterQueue(Generic[T]):
             self.error = None  # the error is reported only once
             raise error
         if self._items.qsize() >= MAX_WAITING_ITEMS:
-            with suppress(Empty):  # the thread has taken all items in the meantime
+            with suppress(Empty):  # raised if the thread has taken all items in the meantime
                 self._items.get_nowait()
                 self.lost += 1
         self._items.put(item)
@@ -155,13 +155,15 @@ class WriterQueue(Generic[T]):
         self._items.put(None)
 
         # Wait as long as the thread completes at least one item within each timeout.
-        earlier_count = -1
+        earlier_count = -1  # differs from every number of written items
         while self._thread.is_alive() and self._written_count != earlier_count:
             earlier_count = self._written_count
             self._thread.join(CLOSE_TIMEOUT_s)
 
-        # End the thread. If the thread ends at the final None, the queue is empty. Otherwise, the queue contains the
-        # lost items and the None. The None counts for one more lost item, which the thread had taken but not written.
+        # The thread has ended, or the consumer accepts no item. End the thread, and count the lost items. If the thread
+        # has ended at the final None, the queue is empty, and no item is lost. Otherwise, the queue contains the
+        # waiting items and the None. One more item is lost, which the thread has taken from the queue but not written.
+        # The length of the queue is the right number, because the None counts for this item.
         self._is_abandoned = True
         self._thread.join(CLOSE_TIMEOUT_s)
         self.lost += self._items.qsize()
@@ -172,9 +174,9 @@ class WriterQueue(Generic[T]):
             for item in iter(self._items.get, None):  # ends at the None that `close` appends
                 if self._is_abandoned:
                     return
-                if self._write(item) is False:
+                if self._write(item) is False:  # `write` reports that it could not write the item
                     self.lost += 1
-                self._written_count += 1
+                self._written_count += 1  # also for such an item, because the consumer still accepts items
         except Exception as error:  # `put` raises it again in the thread of the caller
             self.error = error
 
@@ -203,6 +205,7 @@ class FileOutput:
         self.path = path
         # When the stack is closed, it closes the file and, in a replay, gives the file its final name.
         self._stack = ExitStack()
+        # A file with records of a sensor has its final name at once. It is kept even if it remains incomplete.
         written_path = path if is_live else self._stack.enter_context(new_file(path))
         self._file = AtomicWriter(written_path)
         self._stack.callback(self._file.close)

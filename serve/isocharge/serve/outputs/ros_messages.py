@@ -136,7 +136,7 @@ def pose_stamped(values: Mapping[str, Any], time_ns: int) -> bytes | None:
         time_ns: Time of the record, ns.
 
     Returns:
-        The message; None if nothing touches the film.
+        The message; None if nothing touches the film, so that the position and its standard deviation are unknown.
     """
     if None in (values["x_mm"], values["x_std_mm"]):
         return None
@@ -146,6 +146,7 @@ def pose_stamped(values: Mapping[str, Any], time_ns: int) -> bytes | None:
     std_m = [1e-3 * values["x_std_mm"], 1e-3 * values["y_std_mm"], DEFLECTION_STD_m]
     covariance = np.diag(np.append(np.square(std_m), [ROTATION_VARIANCE_rad2] * 3))
     covariance[[0, 1], [1, 0]] = std_m[0] * std_m[1] * (values["xy_correlation"] or 0.0)
+    # `_stamped` encodes a header and the numbers of the message.
     return _stamped(values["frame_id"], time_ns, (*position, *no_rotation, *covariance.ravel().tolist()))
 
 

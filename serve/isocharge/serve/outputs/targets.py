@@ -120,8 +120,8 @@ class Outputs:
         self._context = context
         self._writers: dict[str, Callable[[PredictionRecord], object]] = {}
         self._stack = ExitStack()  # closes or discards all outputs, the latest first
-        self._is_discarded = False
-        self.not_written: dict[str, int | None] = {}
+        self._discards_all = False  # whether the outputs are discarded instead of closed, because records are missing
+        self.not_written: dict[str, int | None] = {}  # number of missing records by target; None if it is unknown
 
     @contextmanager
     def _named_errors(self, target: str) -> Iterator[None]:
@@ -142,10 +142,11 @@ class Outputs:
                     output = kind.open(target, self._context)
                     write = output.write
             except BaseException:
-                self._is_discarded = True
+                self._discards_all = True
                 self._stack.close()
                 raise
-            # A live stream must not wait for a slow consumer, so its records are written by another thread.
+            # A live stream must not wait for a slow consumer, so its records are written by another thread, which takes
+            # them from a queue. A replay writes them directly, and has no queue.
             queue = WriterQueue(write) if self._context.is_live else None
             self._writers[target] = write if queue is None else queue.put
             self._stack.callback(self._close_or_discard, target, output, queue)
@@ -157,7 +158,7 @@ class Outputs:
         If an exception has ended a replay, the outputs are discarded instead of closed, and their incomplete files are
         removed.
         """
-        self._is_discarded = error is not None and not self._context.is_live
+        self._discards_all = error is not None and not self._context.is_live
         self.close()
 
     @property
@@ -184,18 +185,22 @@ class Outputs:
         """Raise the error of an output, or log the error and write no further records to the output.
 
         In a replay, every error is raised. In a live stream, only an error of standard output is raised, and the stream
-        continues without any other output that has failed. Only the first error of an output is written to the log.
+        continues without any other output that has failed. Only the first error of an output is written to the log. The
+        output is removed from `_writers`, and the number of its missing records is unknown.
 
         Raises:
             Exception: The error, with its cause and the target.
         """
         try:
-            with self._named_errors(target):  # not around each call of an output, which would take longer
+            # Raise the error again, so that `_named_errors` adds the target to its message. The calls of an output are
+            # not made in this context, because they would take longer.
+            with self._named_errors(target):
                 raise error
         except Exception as named_error:
             if not self._context.is_live or self._kinds[target].is_standard_output:
                 raise
-            if self._writers.pop(target, None) is not None:  # this is the first error, after which there is no writer
+            # Remove the writer. If it was removed before, this is not the first error of the output.
+            if self._writers.pop(target, None) is not None:
                 log.error("%s: stopped (%s); the records after that are missing", target, named_error)
         self.not_written[target] = None  # the number is unknown
 
@@ -212,8 +217,11 @@ class Outputs:
         """Close an output if it contains all records, and otherwise discard it.
 
         An output is incomplete in three cases: a replay was stopped, another output could not be opened, or this output
-        has failed. In the first two cases, all outputs are discarded (`_is_discarded`). An error that occurs meanwhile
+        has failed. In the first two cases, all outputs are discarded (`_discards_all`). An error that occurs meanwhile
         is only written to the log, because the error that has ended the command is more important.
+
+        The number of records that the output has not received is stored in `not_written`, or None if the number is
+        unknown.
 
         Args:
             target: Target of the output, which messages use as its name.
@@ -226,32 +234,32 @@ class Outputs:
         try:
             if queue is not None:
                 queue.close()  # writes the waiting records
-                if queue.error is not None:
-                    self._handle_error(target, queue.error)
+                if queue.error is not None:  # the error of a write that has ended the thread
+                    self._handle_error(target, queue.error)  # logs the error, or raises it for standard output
                 if queue.lost > 0:
                     self.not_written.setdefault(target, queue.lost)  # keeps None, which `_handle_error` has set
                 if queue.is_stuck:  # the thread is still in `write` of the output, which therefore cannot be closed
                     return
             with self._named_errors(target):
                 # `_handle_error` removes the writer of an output that fails.
-                if self._is_discarded or target not in self._writers:
+                if self._discards_all or target not in self._writers:
                     self._discard(output)
                 else:
                     output.close()
         except KeyboardInterrupt:  # the output may be incomplete; a replay then removes the file
             self.not_written[target] = None
             raise
-        except Exception as error:
-            if self._is_discarded:
+        except Exception as error:  # of the output, or raised by `_handle_error` above and now raised once more
+            if self._discards_all:
                 log.error("%s", error)
             else:
                 self._handle_error(target, error)
-        if self._is_discarded:
-            self.not_written[target] = None  # the number of missing records is unknown
+        if self._discards_all:
+            self.not_written[target] = None  # replaces a number of lost records, because more records are missing
 
     def _discard(self, output: Output) -> None:
         """Discard an output, or close an output that has no method `discard`. Remove a file without records."""
         discard_or_close = getattr(output, "discard", output.close)
         discard_or_close()
-        if self._is_discarded and self._context.is_live and isinstance(output, FileOutput):
+        if self._discards_all and self._context.is_live and isinstance(output, FileOutput):
             output.path.unlink()  # another output could not be opened, so the file has no records

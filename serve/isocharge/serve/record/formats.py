@@ -40,6 +40,8 @@ def csv_row(record: PredictionRecord, electrodes: Sequence[str]) -> str:
     cells: list[str] = []
     for name, part in _columns(tuple(electrodes), record.sections):
         value = getattr(record, name)
+        # `part` is the name of an electrode in a dictionary of charges, or of an attribute of a struct. It is None if
+        # the field has a single column.
         if part is not None and value is not None:
             value = value[part] if isinstance(value, dict) else getattr(value, part)
         cells.append(cell_text(value))
@@ -120,19 +122,19 @@ def _object(electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
         electrodes: Names of the electrodes.
         allows_null: Whether fields that may be unknown may be null.
     """
-    properties = {field.name: _property(field, electrodes, allows_null=allows_null) for field in RECORD_FIELDS}
+    properties = {field.name: _field_schema(field, electrodes, allows_null=allows_null) for field in RECORD_FIELDS}
     required = sorted(field.name for field in RECORD_FIELDS if not field.section)
     return {"type": "object", "properties": properties, "required": required}
 
 
-def _property(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
+def _field_schema(field: Field, electrodes: Sequence[str], *, allows_null: bool) -> dict[str, Any]:
     """Return the JSON Schema of one field.
 
     Args:
         field: Field of the record.
         electrodes: Names of the electrodes.
-        allows_null: Whether the schema allows null for every field that may be unknown, and for every number in an
-            object. If not, the schema declares only the type of known values.
+        allows_null: Whether a value that may be unknown may be null, as may each number in an object. If false, the
+            schema declares only the type of known values.
     """
     json_type = field.json_type
     schema: dict[str, Any] = {"type": [json_type, "null"] if allows_null and field.may_be_null else json_type}

@@ -53,20 +53,22 @@ class Field(NamedTuple):
 def fields_of(struct: type[Struct]) -> tuple[Field, ...]:
     """Return the fields of a struct in the order of their declaration.
 
-    The annotation of each field contains a sentence that describes the value. The annotation of an optional field also
-    contains the section of the device file that adds the field, as in `Annotated[str | None, "Event that begins.",
-    "track"]`. An attribute without such an annotation is not a field of the JSON object.
+    The annotation of each field is `Annotated` with the type and a sentence that describes the value. A second text is
+    the section of the device file that adds the field, as in `Annotated[str | None, "Event that begins.", "track"]`.
+    Without a second text, every record has the field. An attribute without such an annotation is not a field of the
+    JSON object.
     """
     fields: list[Field] = []
     for name, annotation in get_type_hints(struct, include_extras=True).items():  # with the metadata of `Annotated`
         if get_origin(annotation) is not Annotated:
             continue
-        declared_type, meaning, *section = get_args(annotation)  # `section` is empty for a field of every record
-        may_be_null = isinstance(declared_type, UnionType)  # the other alternative is None
+        declared_type, meaning, *section_or_nothing = get_args(annotation)  # a list of one text or of no text
+        may_be_null = isinstance(declared_type, UnionType)  # a union such as `float | None`, always with None
         value_type = get_args(declared_type)[0] if may_be_null else declared_type
-        parts = () if value_type in JSON_TYPES else fields_of(value_type)
+        # A type that is not in `JSON_TYPES` is a struct, whose fields are the parts of the JSON object.
+        nested_fields = () if value_type in JSON_TYPES else fields_of(value_type)
         json_type = JSON_TYPES.get(value_type, "object")
-        fields.append(Field(name, json_type, meaning, may_be_null, parts, "".join(section)))
+        fields.append(Field(name, json_type, meaning, may_be_null, nested_fields, "".join(section_or_nothing)))
     return tuple(fields)
 
 
@@ -173,7 +175,7 @@ class PredictionRecord(Struct, frozen=True, kw_only=True, dict=True):
         Raises:
             ValueError: If a number is not finite.
         """
-        stored_line: str | None = self.__dict__.get("line")
+        stored_line: str | None = self.__dict__.get("line")  # None at the first call
         if stored_line is not None:
             return stored_line
         values: dict[str, Any] = {}
