@@ -38,8 +38,8 @@ def describe_film(name: str, metadata: ModelMetadata) -> dict[str, Any]:
 def _electrode_polygons(sensor: dict[str, Any], electrodes: tuple[str, ...]) -> dict[str, list[Array]]:
     """Return the polygons of each electrode at its calibrated place, or at its designed place without a calibration.
 
-    The first polygon of an electrode is its pad. All further polygons describe additional metal that belongs to the
-    electrode, such as leads.
+    The calibration has measured a rotation and a shift of all electrodes. The first polygon of an electrode is its pad.
+    All further polygons describe additional metal that belongs to the electrode, such as leads.
 
     Args:
         sensor: Description of the sensor in the metadata of the model, which may be incomplete.
@@ -81,4 +81,4 @@ def _designed_polygons(parts: dict[str, Any], name: str) -> list[Any]:
     if isinstance(part, dict):
         return [part["polygon_mm"], *part.get("more_mm", [])]
     unit_square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-    return [(unit_square - 0.5) * parts["side_mm"] + part]
+    return [(unit_square - 0.5) * parts["side_mm"] + part]  # here, `part` is the point in the middle

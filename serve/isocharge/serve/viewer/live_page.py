@@ -137,8 +137,8 @@ class LivePage(Application):
         self._electrodes = description["electrodes"]
         dtype = sample_type(self._electrodes)
         self.tape: Tape = RecordedTape(dtype) if is_recording else Tape(dtype)
-        self.act: Callable[[Action], None] | None = None
-        self.traffic = Traffic()
+        self.act: Callable[[Action], None] | None = None  # carries out the requests of browsers; None refuses them
+        self.traffic = Traffic()  # counts the requests, for the server
         self._access = access
         self._state: dict[str, Any] = {}
         self._state_lock = Lock()  # the thread of the stream and the thread of the server change the state
@@ -181,6 +181,7 @@ class LivePage(Application):
         if path != REQUEST_PATH:
             raise RequestError(f"nothing is served under {path[:200]!r}; the page is /", 404)
         check_method(path, method, "POST")
+        # The empty text would be the name of a file in the messages of errors.
         request = parse_json(body, "", RequestError, Read | Action)  # type: ignore[arg-type]
         if isinstance(request, Read):
             return json_response(self._read(request))
@@ -192,24 +193,26 @@ class LivePage(Application):
     def _read(self, request: Read) -> dict[str, Any]:
         """Return the samples that a browser does not have yet, and the state of the stream if the state has changed.
 
-        If the request does not state the first sample, the samples of the last `HISTORY_S` seconds are returned.
+        If the request does not state the first sample, the samples of the last `HISTORY_S` seconds are returned. At
+        most `request.most` samples are returned. Samples are numbered from the beginning of the stream.
         """
         tape = self.tape
-        version = self._version
-        stop = tape.total  # number after that of the last sample to return
-        oldest_time_s, end_s = tape.span()
+        version = self._version  # read before the state, so that a change in the meantime is sent with the next request
+        stop_number = tape.total  # number after that of the last sample to return
+        oldest_time_s, end_s = tape.span()  # unix times of the oldest and the latest sample
         if request.until_s is not None:  # the browser shows an earlier part of a recording
             end_s = oldest_time_s + request.until_s
-            stop = tape.first_number_after(end_s)
-        first = tape.first_number_after(end_s - HISTORY_S) if request.first is None else request.first
-        samples = coalesce(tape.samples(first, stop), request.most)
+            stop_number = tape.first_number_after(end_s)
+        first_number = tape.first_number_after(end_s - HISTORY_S) if request.first is None else request.first
+        samples = coalesce(tape.samples(first_number, stop_number), request.most)
         content: dict[str, Any] = {
-            "first": stop,  # number of the first sample of the next request
-            "missed": max(tape.oldest - first, 0),  # samples that were overwritten before the browser asked for them
+            "first": stop_number,  # number of the first sample of the next request
+            "missed": max(tape.oldest - first_number, 0),  # overwritten before the browser asked for them
             "sent_s": time.time(),
             "samples": samples.tolist(),
         }
         if version != request.version:
+            # `extent` describes a recording, and is empty for a live stream.
             content |= {"version": version, "state": self._state | tape.extent()}
         return content
 

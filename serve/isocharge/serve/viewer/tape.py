@@ -56,13 +56,14 @@ def sample_values(record: PredictionRecord, electrodes: tuple[str, ...]) -> tupl
     """
     # If there is a tracked contact, its numbers replace the numbers of the record. A tracked contact has only some of
     # the numbers: the position and the force, for example, but not the time. The other numbers come from the record.
-    contact = record.tracked or record
-    values = [getattr(contact, name, getattr(record, name)) for name in RECORD_NUMBERS]
+    best_source = record.tracked or record
+    values = [getattr(best_source, name, getattr(record, name)) for name in RECORD_NUMBERS]
     other_position = (None, None) if record.other is None else (record.other.x_mm, record.other.y_mm)
     flags = sum(FLAG_BITS.get(flag, 0) for flag in record.flags)
     record_count = 1  # `coalesce` adds the counts of the samples that it replaces by a single sample
     charge_pC = record.charge_pC or {}
     charges = [charge_pC.get(electrode) for electrode in electrodes]
+    # `record.contact` is true while something touches the film.
     return *values, *other_position, flags, float(record.contact), record_count, *charges
 
 
@@ -86,7 +87,10 @@ def coalesce(samples: Samples, max_samples: int) -> Samples:
 
 
 def _coalesced_run(run: Samples) -> Samples:
-    """Return the sample that replaces a run of neighbouring samples, as `coalesce` describes, shape (1,)."""
+    """Return the sample that replaces a run, which is a sequence of neighbouring samples, shape (1,).
+
+    It is one of these samples, as `coalesce` describes, with the flags of all samples and the sum of their records.
+    """
     # Choose the latest sample, unless only earlier samples are contacts.
     is_contact = run["contact"] == 1.0
     chosen_index = len(run) - 1
@@ -96,6 +100,7 @@ def _coalesced_run(run: Samples) -> Samples:
 
     # Combine the flags and the numbers of records of all samples.
     chosen = run[[chosen_index]]  # a copy
+    # All fields of a sample are stored as floating-point numbers, but flags are sums of bits.
     chosen["flags"] = np.bitwise_or.reduce(run["flags"].astype(np.int64))
     chosen["records"] = run["records"].sum()
     return chosen
@@ -190,11 +195,12 @@ class RecordedTape(Tape):
     def append(self, values: tuple[float | None, ...]) -> None:
         """Append a sample. If the buffer is full, double its size first, so that no sample is replaced.
 
-        If the clock was set back, a sample with an earlier time gets the time of the previous sample. The page can
-        therefore show the recording up to any time.
+        The samples are searched by their times, which must therefore not decrease. If the clock was set back, a sample
+        with an earlier time gets the time of the previous sample, as does a sample without a time.
 
         Args:
-            values: The numbers of the sample, in the order of the fields of the type `dtype`. None is stored as NaN.
+            values: The numbers of the sample, in the order of the fields of the type `dtype`. The first number is the
+                Unix time, s. None is stored as NaN.
         """
         is_full = self.total == len(self._ring)
         if is_full:
@@ -202,6 +208,7 @@ class RecordedTape(Tape):
             larger_ring[: self.total] = self._ring
             self._ring = larger_ring
         time_s, *others = values
+        # The time of the previous sample is the time with the number `total` - 1, or 0 for the first sample.
         super().append((max(self.timestamp(self.total - 1), time_s or 0.0), *others))
 
     def extent(self) -> dict[str, Any]:
@@ -209,7 +216,7 @@ class RecordedTape(Tape):
 
         The overview contains the largest force in each of `MAX_DRAWN_SAMPLES` pieces of the recording, N.
         """
-        samples = self._ring[: self.total]
+        samples = self._ring[: self.total]  # all samples, because a recording never overwrites any
         start_s, end_s = self.span()
         elapsed = (samples["timestamp"] - start_s) / max(end_s - start_s, np.finfo(float).tiny)  # from 0 to 1
         piece_of_sample = (elapsed * MAX_DRAWN_SAMPLES).clip(0, MAX_DRAWN_SAMPLES - 1).astype(int)

@@ -88,6 +88,8 @@ class VirtualScript(Settings, frozen=True):
     def script(self, rate_Hz: float) -> Script | None:
         """Return the presses at the time of each frame, or None if the file has no rows and the presses are random.
 
+        The rows of `presses` are moments of the presses. Between them, the contact is interpolated linearly.
+
         Args:
             rate_Hz: Number of frames per second, Hz.
         """
@@ -100,6 +102,8 @@ class VirtualScript(Settings, frozen=True):
 
 def _interpolate(rows: Array, t_s: Array, rate_Hz: float, min_force_N: float = 0.0) -> Script:
     """Return a script whose contacts are interpolated linearly between rows.
+
+    A force above 0 is raised to `min_force_N` if it is smaller.
 
     Args:
         rows: Rows (seconds, x_mm, y_mm, force_N), shape (n, 4), with increasing times.
@@ -133,7 +137,7 @@ def wander(
     radius_mm: float = DEFAULT_RADIUS,
     force_range_N: tuple[float, float] = DEFAULT_PLAYED_FORCE_RANGE,
 ) -> Script:
-    """Create a script of random presses that move over the film, with a pause after each press.
+    """Create a script of random presses that wander over the film, with a pause after each press.
 
     Each press moves from one random point to another, while its force changes from one random force to another. The
     forces stay within the given range, because a forward map is only valid in a range of forces. The script begins with
@@ -157,10 +161,10 @@ def wander(
         time_s = [start_s, start_s + RAMP_S, end_s - RAMP_S, end_s]
         distance_mm = radius_mm * np.sqrt(rng.uniform(size=2))  # distributes the two points evenly over the disk
         points = distance_mm * np.exp(2j * np.pi * rng.uniform(size=2))  # x + iy
-        position = np.repeat(points, 2)  # first, first, last, last
+        position = np.repeat(points, 2)  # x + iy of the four rows: first, first, last, last
         first_force_N, last_force_N = min_force_N * (max_force_N / min_force_N) ** rng.uniform(size=2)  # even in ln F
         force_N = [0.0, first_force_N, last_force_N, 0.0]
-        rows.append(np.column_stack([time_s, position.real, position.imag, force_N]))
+        rows.append(np.column_stack([time_s, position.real, position.imag, force_N]))  # one array for each press
         start_s = end_s + rng.uniform(*PAUSE_DURATION_S)
     frame_time_s = np.arange(round(seconds * rate_Hz)) / rate_Hz
     return _interpolate(np.concatenate(rows), frame_time_s, rate_Hz, min_force_N)

@@ -58,6 +58,8 @@ class PseudoPort:
     def write_whole(self, data: bytes) -> bool:
         """Write data without waiting. If the buffer does not have enough room for all data, nothing is written.
 
+        `_writer` and `_reader` are the two ends of the pseudo-terminal.
+
         Args:
             data: The bytes of one frame.
 
@@ -74,7 +76,7 @@ class PseudoPort:
             written_count = os.write(self._writer, data)
         except BlockingIOError:  # the buffer is full
             return False
-        return written_count == len(data)
+        return written_count == len(data)  # `PORT_BUFFER_BYTES` makes a partial write unlikely
 
     def discard_received(self) -> None:
         """Discard the bytes that the connected program has sent. A full buffer would block this program."""
@@ -138,23 +140,25 @@ class VirtualSensor:
         charges: Charges,
         script: Script,
         *,
-        noise: Noise = lambda charge_pC, _: charge_pC,
+        noise: Noise = lambda charge_pC, _rng: charge_pC,
         offset_pC: Sequence[float] | None = None,
         seed: int = 0,
         encode: Encode = encode_frame,
         faults: Faults | None = None,
         link: Path | None = None,
     ) -> None:
-        """Compute the charges of the script.
+        """Prepare the simulated board, and compute the touch charges of its script.
 
         Args:
-            charges: Forward map. The map is called once, for the frames in which something touches the film.
+            charges: Forward map, a function from contacts to charges. It is called once, for the frames in which
+                something touches the film.
             script: The presses.
-            noise: Amplifier. By default, the measured charges are the charges of the film.
+            noise: Amplifier, a function from charges and a random generator to measured charges. By default, the
+                measured charges are the charges of the film.
             offset_pC: Charge of each electrode that is added to every frame, pC. A reader measures the added charges as
                 its tare. By default, the added charges are drawn at random.
             seed: Seed of noise, offset and faults.
-            encode: Frame format.
+            encode: Frame format, a function from a frame to its bytes.
             faults: Faults between the sensor and the reader; none by default.
             link: Path of a symbolic link to the port. The link exists while the context is active.
 
@@ -164,12 +168,12 @@ class VirtualSensor:
         """
         self._rng = np.random.default_rng(seed)
         self.script = script
-        self._noise = noise
+        self._amplify = noise
         self._encode = encode
         self._faults = faults or Faults()
         self._link = link
-        self._clean_pC = _clean_charges(charges, script)  # touch charges of the script, shape (n, electrodes)
-        n_electrode = self._clean_pC.shape[1]
+        self._noiseless_pC = _noiseless_charges(charges, script)  # touch charges of the script, shape (n, electrodes)
+        n_electrode = self._noiseless_pC.shape[1]
         random_pC = self._rng.uniform(-MAX_RANDOM_OFFSET_pC, MAX_RANDOM_OFFSET_pC, n_electrode)
         self._offset_pC = random_pC if offset_pC is None else np.reshape(offset_pC, n_electrode)
 
@@ -195,13 +199,15 @@ class VirtualSensor:
 
         The bytes are empty if the frame is lost because of a fault.
 
-        The charges are computed in blocks of frames. The script is repeated without end.
+        The charges are computed in blocks of frames, because the amplifier (`_amplify`) adds noise and processes the
+        charges in the order of time. The script is repeated without end.
         """
         block_size = max(1, round(BLOCK_S * self.script.rate_Hz))
         for first_frame in itertools.count(step=block_size):
             rows = range(first_frame, first_frame + block_size)
-            clean_pC = self._clean_pC.take(rows, axis=0, mode="wrap")  # after its last row, the script begins again
-            block_pC = self._noise(clean_pC, self._rng) + self._offset_pC  # shape (block_size, electrodes)
+            # After its last row, the script begins again.
+            noiseless_pC = self._noiseless_pC.take(rows, axis=0, mode="wrap")
+            block_pC = self._amplify(noiseless_pC, self._rng) + self._offset_pC  # shape (block_size, electrodes)
             for frame_number, charge_pC in zip(rows, block_pC.tolist(), strict=True):
                 yield self._frame_bytes(frame_number, tuple(charge_pC))
 
@@ -222,7 +228,7 @@ class VirtualSensor:
             return b""
         t_us = round(1e6 * frame_number / self.script.rate_Hz) % T_US_MODULUS
         data = self._encode(Frame(frame_number % SEQ_MODULUS, t_us, charge_pC))
-        if not self._faults.corrupt_share:
+        if not self._faults.corrupt_share:  # 0: no bytes are damaged, and no random numbers are drawn
             return data
         damaged_data = corrupt(data, self._faults.corrupt_share, self._rng)
         if damaged_data != data:
@@ -247,7 +253,7 @@ class VirtualSensor:
             writer.start()
             stack.callback(writer.join)
             stack.callback(stop.set)  # called before `writer.join`, because an exit stack calls the last callback first
-            self._port_stack = stack.pop_all()
+            self._port_stack = stack.pop_all()  # so that the port remains open after this block, until `__exit__`
         self.port_path = port.url
         return self
 
@@ -270,19 +276,20 @@ class VirtualSensor:
                 self.paused_s += lateness_s
 
             port.discard_received()
-            if not data:
+            if not data:  # a fault has removed the frame
                 self.lost += 1
             elif port.write_whole(data):
                 self.sent += 1
-            else:
+            else:  # the frame does not fit into the buffer of the port
                 self.withheld += 1
 
 
-def _clean_charges(forward: Charges, script: Script) -> Array:
+def _noiseless_charges(forward: Charges, script: Script) -> Array:
     """Compute the touch charges of all frames of a script, without noise.
 
     Args:
         forward: Forward map: function from contacts (x, y, force), shape (k, 3), to charges, shape (k, electrodes), pC.
+            It is called for the k frames in which something touches the film.
         script: Contacts of n frames.
 
     Returns:
