@@ -272,7 +272,7 @@ class Predictor:
         result = Contacts(*add_covariance(contacts, covariance).T)
         return result._replace(misfit=(result.misfit / noise_ratio).astype(np.float32))
 
-    def noise_effects(self, charge_pC: Array, noise_std_pC: Array) -> tuple[Singles, Array]:
+    def noise_effects(self, charge_pC: Array | Singles, noise_std_pC: Array) -> tuple[Singles, Array]:
         """Compute contacts, and the change of each contact by the noise of each charge.
 
         Each charge is raised and lowered by the standard deviation of its noise. Half of the difference between the two
