@@ -21,6 +21,7 @@ def test_theory_by_name_finds_the_theory_with_this_name(bending):
         theory_by_name("linear plate")
 
 
+@pytest.mark.first_cases(1)
 @pytest.mark.parametrize(
     ("probe", "film"),
     [

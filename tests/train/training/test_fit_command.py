@@ -1,11 +1,10 @@
-"""The command `train fit`: imports, a warning of presses without forces, and a release that is refused."""
+"""The command `train fit`: imports, and a release that is refused."""
 
 import re
 import sys
 import tempfile
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from isocharge.cli.train import fit as fit_command
@@ -45,20 +44,6 @@ finally:
     metadata = load_model(version_folder).metadata
     assert metadata.yield_force_N == pytest.approx(0.866, abs=0.01)
     assert metadata.unnoticed.to_mm == pytest.approx(42.8, abs=0.01)
-
-
-def test_each_caution_about_a_file_of_presses_is_printed_once(tmp_path, command):
-    (tmp_path / "short.toml").write_text(SHORT_CONFIG)
-    rng = np.random.default_rng(0)
-    position = rng.uniform(-8.0, 8.0, (500, 2))
-    charge = 100.0 * np.exp(position @ [[0.1, -0.1, 0.0], [0.0, 0.1, -0.1]]) + rng.standard_normal((500, 3))
-    table = np.column_stack([position, charge])
-    np.savetxt(tmp_path / "presses.csv", table, delimiter=",", header="x_mm,y_mm,p,q,r", comments="")
-    words = (tmp_path / "presses.csv", "--config", tmp_path / "short.toml", "-o", tmp_path / "model")
-    code, _, err = command("train", "fit", *words)
-    assert code == 0, err
-    assert "no press has a known force" in err
-    assert err.count("caution: ") == 1
 
 
 OBSTACLES = {"m": "a file", "m/config.pbtxt": "a model of another sensor", "m/1": "the same version"}
