@@ -140,6 +140,7 @@ UNNAMED_NOTATIONS = [
     "RAW {a} {b} {c} END",
     "<{a},{b},{c}>",
     "{a},{b},{c},OK",
+    ">{a},{b},{c},t",
     "touch;{a};{b};{c};idle",
     ">>> {a}, {b}, {c}",
     '"{a}","{b}","{c}"',

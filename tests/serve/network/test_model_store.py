@@ -153,6 +153,7 @@ def test_model_name_is_not_taken_as_a_path(store, name):
     for method in (store.get, store.load, store.unload):
         with pytest.raises(ModelNotFound):
             method(name)
+    assert name not in store._versions
 
 
 SECRET = 'open "sesame"'

@@ -79,13 +79,13 @@ def _teleplot_content(text: str) -> str:
     value and its time, as in `t_ms:1010;"A":801.2§pC`.
 
     The result is empty if the flags state that the value is a text (t) or a point in a plane (xy). A line that is no
-    Teleplot line is returned unchanged, unless one of the texts between its commas is such a flag.
+    Teleplot line is returned unchanged.
 
     Args:
         text: A line that begins with `>`.
     """
-    flags = text.rpartition("|")[2].split(",")  # behind the last bar, or of the whole line without a bar
-    if "t" in flags or "xy" in flags:
+    _, bar, flags = text.rpartition("|")  # without a bar, the line has no flags
+    if bar and {"t", "xy"}.intersection(flags.split(",")):
         return ""
     teleplot = re.fullmatch(_TELEPLOT, text)
     if teleplot is None:

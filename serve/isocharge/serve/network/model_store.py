@@ -177,7 +177,8 @@ class ModelStore:
         """
         with self._change_lock:
             folders = self._folders()
-            self._load_versions(name, folders.get(name))
+            if name in folders.keys() | self._versions.keys():  # a client cannot fill the table with other names
+                self._load_versions(name, folders.get(name))
         if name not in folders:  # its loaded versions have just been kept, because no version was found
             raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
         # All valid versions are loaded now. The error only reports which versions are refused.

@@ -229,8 +229,8 @@ class Piezo:
         """
         smallest, largest = PIEZO_LIMITS
         for name, coefficient in vars(self).items():
-            # The pyroelectric coefficient has another unit, pC/(mm^2 K), but the same limits.
-            check_range(f"piezo {name}", coefficient, (-largest, largest), "pC/N", SensorError)
+            unit = "pC/(mm^2 K)" if name == "pyro" else "pC/N"
+            check_range(f"piezo {name}", coefficient, (-largest, largest), unit, SensorError)
             may_be_tiny = name in ("pyro", "d12")  # d12 is an imperfection
             if not may_be_tiny and 0.0 < abs(coefficient) < smallest:
                 raise SensorError(
