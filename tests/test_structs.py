@@ -144,11 +144,11 @@ def test_files_that_are_none(tmp_path, read, content, message):
             read(path)
 
 
-@pytest.mark.parametrize("path", ["$.zzz", "$[0]", "$[...]", "$.name.b"])
+@pytest.mark.parametrize("path", ["$.zzz", "$[0]", "$[...]"])
 def test_key_that_imitates_the_path_of_a_message_is_named(path):
     key = f"a` - at `{path}"
     with pytest.raises(DeviceError, match=re.escape(key)):
-        convert({"name": "x", key: 1}, Part, "board.toml", DeviceError)
+        convert([{"name": "x", key: 1}], list[Part], "board.toml", DeviceError)
 
 
 def test_nested_values_become_json_and_values_without_a_notation_null():

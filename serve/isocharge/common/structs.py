@@ -196,6 +196,9 @@ def _prefix(where: str) -> str:
     return f"{where}: " if where else ""
 
 
+_LIST_INDEX = re.compile(r".* - at `\$\[(\d+)\][^`]*`$", re.DOTALL)
+"""Message of msgspec about a wrong item of a list. The place is at its end, because a key may look like a place."""
+
 _KEY_ERROR = re.compile(r"Object (missing required|contains unknown) field `(.*)`$", re.DOTALL)
 """Message of msgspec about a key that is missing or unknown."""
 
@@ -215,6 +218,10 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
         path: Names of the keys that lead to the value; empty for the whole content.
     """
     item_types = _item_types(value, expected_type)
+    wrong_index = _LIST_INDEX.match(str(error))
+    if wrong_index and isinstance(value, list):  # converting each item of a long list would take seconds
+        index = int(wrong_index[1])
+        item_types = {index: item_types[index]}
     for key, item_type in item_types.items():
         try:
             item = value[key]

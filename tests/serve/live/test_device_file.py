@@ -234,7 +234,7 @@ def test_tare_error_states_the_offset_for_the_device_file():
         ("A", "Pad 1", "C"), device_from_table({"tare": {"frames": 5, "patience": 10}}, "board.toml")
     )
     data = b"".join(encoded_frames([(2048.0, 2050.5, 2047.0)] * 20))
-    with pytest.raises(TareError, match=r'\[gain\] offset = \{A = 2048, "Pad 1" = 2050.5, C = 2047\}'):
+    with pytest.raises(TareError, match=r'below pC_per_unit: offset = \{A = 2048, "Pad 1" = 2050.5, C = 2047\}'):
         list(stream.frames(Chunk(data, 1e9, 0)))
 
 

@@ -97,5 +97,5 @@ def test_many_missing_currents_cause_no_touch_and_give_a_touch_the_flag_gap():
 
 
 def test_currents_are_refused_in_c():
-    with pytest.raises(DeviceError, match="b: front_end: this stage does not exist in the signal chain in C"):
+    with pytest.raises(DeviceError, match="b: front_end: the C code does not add up currents"):
         device_header(device_from_table({"front_end": "current"}, "b"), ("A", "B", "C"))

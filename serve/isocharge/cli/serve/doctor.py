@@ -220,7 +220,7 @@ def _write_device_file(path: Path, examination: Examination, model: str) -> None
     with as_output_errors(path):
         write_whole(path, device_text(examination).encode())
     if examination.missing:
-        say("put the settings that are missing above into the file")
+        say("mend what is missing above, or put the missing settings into the file")
     if "offset" in examination.device.get("gain", {}):  # the charges of the film at rest
         say("the offsets are right only if nothing lay on the film; a steady weight cannot be noticed")
     command = join(["isocharge", "serve", "stream", model, "--port", examination.url, "--device", str(path)])

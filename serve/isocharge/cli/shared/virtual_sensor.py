@@ -1,6 +1,7 @@
 """A virtual sensor that uses the forward map and the amplifier of the simulation."""
 
 import numpy as np
+import scipy.signal  # noqa: F401 - if the first reading imported it, the first frames would come seconds late
 
 from isocharge.common.arrays import Array
 from isocharge.common.defaults import DEFAULT_PLAYED_FORCE_RANGE

@@ -273,5 +273,3 @@ def replay(
             pending_records = stream.feed(chunk)
             if yields_all:
                 yield from pending_records
-    for _ in pending_records:  # process the rest of the last chunk
-        pass

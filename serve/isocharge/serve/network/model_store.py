@@ -177,8 +177,7 @@ class ModelStore:
         """
         with self._change_lock:
             folders = self._folders()
-            if name in folders.keys() | self._versions.keys():  # a client cannot fill the table with other names
-                self._load_versions(name, folders.get(name))
+            self._load_versions(name, folders.get(name))
         if name not in folders:  # its loaded versions have just been kept, because no version was found
             raise ModelNotFound(f"model {name!r:.200} is not found in the repository")
         # All valid versions are loaded now. The error only reports which versions are refused.
@@ -235,7 +234,8 @@ class ModelStore:
 
         keeps_earlier = not found or any(version.reason for version in found.values())
         versions = earlier | found if keeps_earlier else found
-        self._versions = self._versions | {name: sorted(versions.values())}
+        if versions or name in self._versions:  # a client cannot fill the table with names of missing models
+            self._versions = self._versions | {name: sorted(versions.values())}
 
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics of all models for Prometheus. A registry calls this method."""

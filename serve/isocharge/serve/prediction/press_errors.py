@@ -84,11 +84,6 @@ class PressErrors:
         return self.noise_std**2 + rig_variance
 
     @property
-    def shared_std(self) -> Array:
-        """Standard deviations of the part of the errors that is equal in all presses, shape (n, 3)."""
-        return np.hypot(self.film_std, COMMON_RATIO * self.rig_std)
-
-    @property
     def chi_squared(self) -> Array:
         """Squared Mahalanobis distance between each error (x, y, force) and zero, shape (n,).
 
@@ -335,7 +330,9 @@ class Agreement:
             is_selected: Whether each press is selected, shape (n,).
         """
         error = errors.error[is_selected]
-        common = common_error(error, errors.variance[is_selected], errors.shared_std[is_selected])
+        # Standard deviations of the part of the errors that is equal in all presses
+        shared_std = np.hypot(errors.film_std, COMMON_RATIO * errors.rig_std)
+        common = common_error(error, errors.variance[is_selected], shared_std[is_selected])
         chi_squared = float(errors.chi_squared[is_selected].sum())
         degrees = int(np.count_nonzero(~np.isnan(error)))
 

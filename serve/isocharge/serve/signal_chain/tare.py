@@ -197,8 +197,7 @@ class Tare(Stage):
         """
         value_of_electrode = zip(self._electrodes, frame.sent.tolist(), strict=True)
         offsets = ", ".join(f"{toml_key(name)} = {value:.10g}" for name, value in value_of_electrode)
-        setting = "[gain] offset = {" + offsets + "}"
         return TareError(
             f"cannot tare on the last {len(self._latest_pC)} frames: {reason}; if the board rests there without a "
-            f"touch, say so in a device file: {setting}"
+            f"touch, add to the section [gain] of a device file, below pC_per_unit: offset = {{{offsets}}}"
         )

@@ -43,7 +43,9 @@ def device_header(device: Device, electrodes: tuple[str, ...], *, has_any_sign: 
     """
     setup = Setup(electrodes, device, has_any_sign=has_any_sign)
     if device.has_currents:
-        raise DeviceError(f"{device.where}: front_end: {NOT_IN_C}")
+        raise DeviceError(
+            f"{device.where}: front_end: the C code does not add up currents; run `isocharge serve stream` on a host"
+        )
     macros = {"ISOCHARGE_SUM_TOLERANCE_S": _c_literal(SUM_TOLERANCE_s)}
     chain_source = source_text("isocharge_chain.c")
     host_sections = []

@@ -162,7 +162,7 @@ def check_method(path: str, method: str, allowed: str) -> None:
 
 
 _PATTERNS = [
-    (re.compile(route.path.format(model="(?P<name>[^/]*)", version="(/versions/(?P<version>[^/]+))?")), route)
+    (re.compile(route.path.format(model="(?P<name>[^/]+)", version="(/versions/(?P<version>[^/]+))?")), route)
     for route in ROUTES
 ]
 """Regular expression of the path of each route. The point is the only special character in templates."""

@@ -54,7 +54,8 @@ export class FilmView {
   }
 
   update(state) {
-    this.state = state;
+    const { note } = this.state; // stays until the server has a newer one
+    this.state = note && !(state.note?.at > note.at) ? { ...state, note } : state;
     if (state.model) this.showModel(state.model);
     this.history.markers = state.markers ?? [];
     const record = this.find("[data-do=record]");

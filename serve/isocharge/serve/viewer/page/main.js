@@ -13,10 +13,11 @@ const nowMs = () => performance.now();
 function session(content, isNew) {
   document.getElementById("door").hidden = true;
   if (!isNew) return;
+  if (page.timeline) return location.reload(); // a replay has ended, and another program has its address
   page.film = new FilmView(content, act);
   document.getElementById("film").replaceChildren(page.film.root);
   page.film.start();
-  if (content.is_replay && !page.timeline) page.timeline = new Timeline(document.getElementById("timeline"));
+  if (content.is_replay) page.timeline = new Timeline(document.getElementById("timeline"));
   if (page.isPaused) pause(false);
   document.title = `${content.film.name} · isocharge ${content.is_replay ? "replay" : "live"}`;
 }
