@@ -286,20 +286,14 @@ class Predictor:
             The ten numbers of each contact, shape (n, 10). Changes of x (mm), y (mm) and the force (N) by the noise of
             each electrode, shape (electrodes, n, 3).
         """
-        # The step k changes only the charge k of every press. The axes are the step, the press and the charge.
-        n_press, n_electrode = charge_pC.shape
-        selection = np.eye(n_electrode)[:, np.newaxis]  # shape (electrodes, 1, electrodes)
-        steps = noise_std_pC * selection
-        no_step = np.zeros_like(steps[:1])
-
-        # All presses are predicted in one batch: first without a change, then with each charge raised, then lowered.
-        changed_pC = (charge_pC + np.concatenate([no_step, steps, -steps])).astype(np.float32)
-        rows = self.predict_rows(changed_pC.reshape(-1, n_electrode))
-        results = rows.reshape(1 + 2 * n_electrode, n_press, 10)
-        # `COLUMNS` selects x, y and the force from the ten numbers of each contact.
-        changed_contacts = results[1:, :, COLUMNS["contact"]].astype(float)
-        raised, lowered = np.split(changed_contacts, 2)
-        return results[0], 0.5 * (raised - lowered)
+        # One electrode at a time, so that many presses do not need much memory. `COLUMNS` selects x, y and the force.
+        effects = []
+        for is_electrode in np.eye(charge_pC.shape[1]):
+            step_pC = noise_std_pC * is_electrode
+            raised = self.predict_rows((charge_pC + step_pC).astype(np.float32))
+            lowered = self.predict_rows((charge_pC - step_pC).astype(np.float32))
+            effects.append(0.5 * (raised - lowered)[:, COLUMNS["contact"]])
+        return self.predict_rows(charge_pC.astype(np.float32)), np.array(effects, float)
 
     def predict_rows(self, charges: Singles) -> Singles:
         """Compute the contacts of n presses, with the standard deviations for the noise of the training.

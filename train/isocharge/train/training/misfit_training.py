@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from isocharge.common.arrays import Array
+from isocharge.common.progress import track
 from isocharge.simulate.identifiability.nearest_contact import search
 from isocharge.train.data.channel_noise import ChannelNoise, misfit_noise
 from isocharge.train.data.outside_presses import OutsidePresses
@@ -93,8 +94,10 @@ def misfit_examples(
         outside_charge = noise.add(outside.train.charge[rows], rng)
     drawn_charge = draw_charges(rng, split.train.charge, noise, count - len(outside_charge))
     charge = np.clip(np.concatenate([drawn_charge, outside_charge]), features.low_pC, features.high_pC)
-    _, residual = search(split.field, charge, noise.sigma(charge))  # residuals at the nearest contact
-    return np.stack([charge, residual])
+    # Find the residuals at the nearest contacts in parts, so that the training can be stopped between them.
+    parts = np.array_split(charge, 20)
+    searches = [search(split.field, part, noise.sigma(part)) for part in track(parts, "nearest contacts")]
+    return np.stack([charge, np.concatenate([residual for _contact, residual in searches])])
 
 
 def misfit_stage(network: InverseNetwork, examples: Array, config: TrainingConfig) -> TrainingStage:
