@@ -221,7 +221,7 @@ def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationE
     wrong_index = _LIST_INDEX.match(str(error))
     if wrong_index and isinstance(value, list):  # converting each item of a long list would take seconds
         index = int(wrong_index[1])
-        item_types = {index: item_types[index]}
+        item_types = {key: item_type for key, item_type in item_types.items() if key == index}
     for key, item_type in item_types.items():
         try:
             item = value[key]
