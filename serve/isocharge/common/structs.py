@@ -206,9 +206,9 @@ _KEY_ERROR = re.compile(r"Object (missing required|contains unknown) field `(.*)
 def _describe_mistake(value: Any, expected_type: Any, error: msgspec.ValidationError, path: str = "") -> str:
     """Return a description of a mistake, with the names of the keys that lead to the wrong value.
 
-    The items of a table or of a list are converted separately. If an item cannot be converted, the mistake is in this
-    item, and the function calls itself for the item. If all items can be converted, the table or the list itself is
-    wrong, for example because a key is missing.
+    The items of a table are converted separately. Of a list, only the item is converted whose index the message of
+    msgspec contains. If an item cannot be converted, the mistake is in this item, and the function calls itself for the
+    item. Otherwise, the table or the list itself is wrong, for example because a key is missing.
 
     Args:
         value: Value from TOML or JSON.

@@ -37,7 +37,7 @@ def names_and_values(text):
     ("text", "names", "values"),
     [
         *README_OF_TELEPLOT,
-        *((text, ("ch[0]", "ch[1]"), (7.0, 3.0)) for text in ("ch[0] 7 ch[1] 3", "ch[0],7,ch[1],3")),
+        ("ch[0] 7 ch[1] 3", ("ch[0]", "ch[1]"), (7.0, 3.0)),
         ("A=1.5&B=-2", ("A", "B"), (1.5, -2.0)),
         ("Sample #7: A=1.5 unit=nC t_ms=2", ("Sample", "A_nC", "t_ms"), (7.0, 1.5, 2.0)),
         ("1.5,-2*3A", ("", ""), (1.5, -2.0)),

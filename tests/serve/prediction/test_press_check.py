@@ -212,8 +212,8 @@ def test_uncertain_film_causes_the_variance_that_the_noise_does_not_cause(film, 
 def test_error_that_an_uncertain_film_may_cause_in_all_presses_is_accepted(film, tmp_path, checked, measure):
     """The film of a model without noise causes all errors that the model states."""
     uncertain = predictor_with_noise(film, tmp_path, 0.0)
-    for shift_mm, fits_uncertain_film in ((0.06, True), (0.5, False)):
-        conditions = {"seed": 1, "shift_mm": (shift_mm, 0.0)}
+    for noise, shift_mm, fits_uncertain_film in ((1.0, 0.06, True), (1.8, 0.0, True), (1.0, 0.5, False)):
+        conditions = {"noise": noise, "shift_mm": (shift_mm, 0.0)}
         assert checked(40, **conditions).fits is False
         assert check_presses(uncertain, measure(40, **conditions)).fits is fits_uncertain_film
 

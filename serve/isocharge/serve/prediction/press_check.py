@@ -210,9 +210,8 @@ def check_presses(predictor: Predictor, presses: MeasuredPresses) -> PressCheck:
     agreement = Agreement.from_errors(errors, is_selected)
 
     # Summarise the errors of the positions and the errors of the forces, together with the standard deviations that
-    # noise and rig cause. Each array has the columns x, y (mm) and force (relative), shape (n_selected, 3). `FORCE` is
-    # the index of the column of the force.
-    # `errors.error` is the predicted minus the measured value.
+    # noise and rig cause. An error is the predicted minus the measured value. Each array has the columns x, y (mm) and
+    # force (relative), shape (n_selected, 3). `FORCE` is the index of the column of the force.
     selected = (errors.error[is_selected], errors.noise_std[is_selected], errors.rig_std[is_selected])
     position_mm = ErrorSummary.from_errors(*[columns[:, :FORCE] for columns in selected])
     force_percent = ErrorSummary.from_errors(*[100.0 * columns[:, FORCE:] for columns in selected])

@@ -336,18 +336,18 @@ class Agreement:
         chi_squared = float(errors.chi_squared[is_selected].sum())
         degrees = int(np.count_nonzero(~np.isnan(error)))
 
-        # The errors of the film are not independent, which increases the variance of the sum by this factor. Scaled
-        # down by the factor, the sum has the mean and the variance of a chi-squared variable with fewer degrees of
+        # The errors of the film are not independent, which multiplies the variance of the sum by `variance_factor`.
+        # Divided by this factor, the sum has the mean and the variance of a chi-squared variable with fewer degrees of
         # freedom (Satterthwaite 1946).
         film_share = errors.film_std**2 / errors.variance
         film_sum = np.nansum(film_share[is_selected])  # part of the expected sum that the film causes
-        spread = 1.0 + film_sum**2 / (FILM_ERRORS * max(degrees, 1))
+        variance_factor = 1.0 + film_sum**2 / (FILM_ERRORS * max(degrees, 1))
         common_chi_squared = np.nansum(common.significance**2)
         common_degrees = int(np.count_nonzero(~np.isnan(common.mean)))
         return cls(
             chi_squared=chi_squared,
             degrees=degrees,
-            p_value=chi_squared_survival(chi_squared / spread, degrees / spread),
+            p_value=chi_squared_survival(chi_squared / variance_factor, degrees / variance_factor),
             common=common,
             common_p_value=chi_squared_survival(common_chi_squared, common_degrees),
         )

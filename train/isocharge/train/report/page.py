@@ -148,8 +148,8 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
     figure = new_figure(6.5 * len(sections), 4.5)
     panels = figure.subplots(1, len(sections), squeeze=False)
     for axes, section in zip(panels[0], sections, strict=True):
-        answered = [record for record in section.methods if record.errors]  # methods with at least one estimate
-        for record in answered:
+        plotted = [record for record in section.methods if record.errors]  # methods with at least one estimate
+        for record in plotted:
             style: dict[str, Any] = {"marker": "o", "ms": 7}
             if record is section.methods[0]:  # the evaluated model
                 style = {"marker": "*", "ms": 14, "color": FELT}
@@ -161,7 +161,7 @@ def draw_speed(sections: Sequence[Section]) -> Figure:
             axes.axhline(limit_mm, color=INK, ls=":", label=f"Cramér-Rao limit, unbiased, {limit_mm:.3g} mm")
         axes.set(xscale="log", xlabel="time of one prediction, median, us", ylabel="position error, rms, mm")
         axes.set_title(section.sensor)
-        axes.set_ylim(0.0, 1.2 * max(map(_position_error, answered), default=1.0))
+        axes.set_ylim(0.0, 1.2 * max(map(_position_error, plotted), default=1.0))
         axes.xaxis.set_major_formatter("{x:,g}")
         axes.grid(alpha=0.25)
         axes.legend(fontsize=8)
